@@ -131,7 +131,7 @@ class _Builder:
         return self._mixed(made)
 
     def _first(self, symbols: Sequence[str], paired: bool = True) -> Atoms | None:
-        """Return a crystal of the first supported element; if `paired`, find the cutoff with two atoms."""
+        """Return a crystal of the first usable element; if `paired`, find the cutoff from a pair of atoms."""
         for symbol in symbols:
             subject = self.about(Atoms(symbol, [(0, 0, 0)]))
             with subject.trying():
@@ -376,7 +376,7 @@ def _least_distance(cell: Atoms) -> float:
 def _least_energy(
     subject: CalculatorSubject, cell: Atoms, least: float | None, start: float
 ) -> tuple[float, bool]:
-    """Return the scaling factor of the lattice with the lowest energy, and whether it is a minimum."""
+    """Return the lattice scaling factor of lowest energy, and whether the energy has a minimum there."""
 
     def energy(scale: float) -> float:
         try:

@@ -252,7 +252,7 @@ def decay_power(curve: Curve, edge: float, room: float) -> float | None:
 def smallest_steps(
     curve: Curve, low: float, high: float, step: float
 ) -> tuple[Float[np.ndarray, "intervals"], Float[np.ndarray, "intervals"]]:
-    """Return the intervals scanned by `find_jumps`, and the smallest detectable force step in each interval.
+    """Return the intervals scanned by `find_jumps`, and the smallest detectable force jump in each interval.
 
     Returns:
         (midpoints of the compared intervals, smallest detectable force step in each interval, eV/Å).
@@ -405,7 +405,7 @@ def _pieces(curve: Curve, middle: float, reach: float, width: float, degree: int
 def _third(curve: Curve, left: float, right: float, room: float, noise: float) -> list[Jump]:
     """Locate a jump of the energy's third derivative, using the force's second derivative on both sides.
 
-    Of several widths of the fit, the width whose halving changes the result least is used.
+    Several widths of the fit are tried; the width whose halving changes the result least is used.
     """
     reach = 0.5 * (right - left)
     widths = [room / part for part in (6, 12, 24, 48) if room / part > 4 * reach]

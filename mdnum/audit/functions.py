@@ -97,7 +97,7 @@ def _walked(shared: PairPotential) -> Callable[..., tuple[float, float]]:
 
 
 def _ends(cutoff: Any, shared: PairPotential) -> Callable[..., Any]:
-    """Return a function that computes the cut energy and its first derivatives just below given distances."""
+    """Return a function for the truncated energy and its first derivatives just below given distances."""
 
     @jax.jit
     def evaluate(own, r_cut, r_onset, r):

@@ -197,9 +197,9 @@ def order_change(
 ) -> tuple[float, NoiseFloor]:
     """Reorder the atoms; return the largest energy change (eV), and the noise if rounding explains it.
 
-    The noise is 0 if rounding does not explain the energy change. It is also 0 if energies and forces change
-    by no more than the noise along a line of structures. While atoms move along a line, the rounding error of
-    a sum varies randomly, but an error due to missing terms varies smoothly.
+    The noise is 0 if rounding does not explain the energy change. The noise is also 0 if energies and forces
+    change by no more than the noise along a line of structures. While atoms move along a line, the rounding
+    error of a sum varies randomly, but an error due to missing terms varies smoothly.
     """
     count, none = len(atoms), NoiseFloor(0.0, 0.0)
     if count < 2:
@@ -375,7 +375,7 @@ class Digits:
 
 
 def digits(values: np.ndarray) -> Digits:
-    """Return how many decimal places and bits the values use; too few distinct values count as unrounded."""
+    """Return how many decimal places and bits values use; values count as unrounded if few are distinct."""
     found = np.unique(np.asarray(values, dtype=np.float64))
     found = found[np.isfinite(found) & (found != 0.0)]
     if len(found) < _FEWEST:

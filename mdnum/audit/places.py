@@ -43,7 +43,7 @@ class WrongPlaces:
 def wrong_places(subject: CalculatorSubject, atoms: Atoms, allowed: NoiseFloor) -> WrongPlaces | None:
     """Find places in the list of atoms with wrong results, by exchanging atoms of one species in the list.
 
-    Exchanging two equal atoms between correct places in the list changes neither energy nor forces. An error
+    Exchanging two like atoms between correct places in the list changes neither energy nor forces. An error
     tied to a place appears there for any order of the atoms. An error that depends on the order of all atoms,
     such as a neglected neighbor, appears at nearly all places in the list, or moves if atoms are reordered.
 

@@ -50,7 +50,7 @@ class FinalHeight(eqx.Module):
 
 
 class MeanHeight(eqx.Module):
-    """Loss: the height averaged over balls and time steps, m."""
+    """Loss: the height (m), averaged over balls and time steps."""
 
     def step(self, state, record, dtype):
         """Return the height averaged over all balls."""

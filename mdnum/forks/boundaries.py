@@ -162,9 +162,9 @@ class NumberLine:
         return self.known[place].digest
 
     def changes(self, a: int, b: int) -> Iterator[tuple[int, int, dict[int, DecisionHistory]]]:
-        """Yield adjacent ordinals with different decisions, in ascending order, and runs made to find them.
+        """Yield adjacent ordinals whose runs decide differently, in ascending order, and the search's runs.
 
-        A cell is not searched if both of its ends have the same history of decisions.
+        A grid interval is not searched if the runs at both of its ends have the same history of decisions.
         """
         pending = [(a, b)]
         while pending:
@@ -226,11 +226,11 @@ def boundaries(
     """Find the values of a parameter at which the decisions of a run change, within the resolution of a grid.
 
     The system is run at every grid value of the parameter. If the histories of decisions at the two ends of a
-    grid cell differ, the cell is bisected until its ends are adjacent floats. If the decisions also change in
-    the other half of a bisected cell, this half is searched later. Boundaries are searched from the lowest
-    parameter value upward; if more exist than were requested, the highest are missing. All runs use the same
-    program as a normal run; to vary the cutoff radius, the program takes the radius as an argument. A new
-    process repeats the runs on both sides of every boundary.
+    grid interval differ, the interval is bisected until its ends are adjacent floats. If the decisions also
+    change in the other half of a bisected interval, this half is searched later. Boundaries are searched from
+    the lowest parameter value upward; if more exist than were requested, the highest are missing. All runs
+    use the same program as a normal run; to vary the cutoff radius, the program takes the radius as an
+    argument. A new process repeats the runs on both sides of every boundary.
 
     Args:
         steps: last step; default the system's own. For arguments not listed here see `mdnum.fork_map`.
@@ -299,7 +299,7 @@ def _run(task: tuple[NumberLine | bytes, int]) -> DecisionHistory:
 def _searched(
     task: tuple[NumberLine | bytes, dict[int, DecisionHistory], int],
 ) -> list[tuple[Boundary | None, dict[int, DecisionHistory]]]:
-    """Find the lowest boundaries in a grid cell; return each with the runs that were made to find it."""
+    """Find the lowest boundaries in a grid interval; return each with the runs that were made to find it."""
     own, ends, most = task
     line = _line_of(own)
     line.known |= ends

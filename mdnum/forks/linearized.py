@@ -1,16 +1,16 @@
 """The linearized run: how a small perturbation of the start grows, and which decisions this growth changes.
 
 The tangent (the derivative of the state) is propagated along the recorded states, with the neighbor lists of
-the run. The reference is therefore the recorded run, bit for bit. The exponential growth rate of the tangent
-is the largest Lyapunov exponent. The tangent is rescaled repeatedly (Benettin, Galgani, Giorgilli and
-Strelcyn 1980) and, unlike the distance between two runs, does not saturate.
+the run. The reference trajectory is therefore the recorded run, bit for bit. The exponential growth rate of
+the tangent is the largest Lyapunov exponent. The tangent is rescaled repeatedly (Benettin, Galgani, Giorgilli
+and Strelcyn 1980) and, unlike the distance between two runs, does not saturate.
 
 Each decision has a margin m and a tangent dm/da, where a is the amplitude of the perturbation. To first
 order, the decision flips at a = -m / (dm/da). At each step, a perturbation below the smallest flip amplitude
 flips no decision. The prediction holds as long as the perturbed run remains close to the reference run and
 makes the same decisions. If the force jumps at the cutoff, the first flip changes the momenta of both atoms.
-The forecast ends at this flip, because the linearization no longer describes the perturbed run. If the force
-is continuous at the cutoff, a flip does not change the motion to first order.
+The forecast ends at the first flip, because the linearization no longer describes the perturbed run. If the
+force is continuous at the cutoff, a flip does not change the motion to first order.
 """
 
 from __future__ import annotations
@@ -237,15 +237,15 @@ class Lyapunov:
     def ratio(self, seen: Growth) -> float:
         """Divide the rate at which two runs diverge by the Lyapunov exponent; NaN if the run is not chaotic.
 
-        The dynamics separates runs at the Lyapunov rate; if two runs diverge faster, flips separated them.
+        Without flips, two runs diverge at the Lyapunov rate; faster divergence must be due to flips.
         """
         return seen.rate / self.rate if self.chaotic else float("nan")
 
     def steps_to(self, start: float, end: float) -> float | None:
         """Return the step at which a displacement has grown from an initial length to a given length.
 
-        During the run, a displacement grows like the tangent. Later growth is extrapolated exponentially. For
-        a run that is not chaotic, the result is None if the displacement does not reach `end`.
+        Displacement and tangent grow by the same factor during the run, and exponentially after the run. If
+        the run is not chaotic, the result is None if the displacement does not reach `end` during the run.
 
         Args:
             start: largest displacement of an atom at the start, length; for example one rounding unit.
@@ -307,7 +307,7 @@ class PredictedFlip:
 
 
 class ForecastRange(NamedTuple):
-    """The last step at which a forecast for one perturbation amplitude is valid, and why it ends there."""
+    """The last step at which a forecast for one perturbation amplitude is valid, and the reason for it."""
 
     step: int  # the last one; -1 for none
     # why there: "end" of the run; "flip", the first one kicks its atoms; "close", whether a decision of the
@@ -320,7 +320,7 @@ class ForecastRange(NamedTuple):
 class Forecast:
     """First-order prediction of the decisions flipped by perturbations of the start along one direction.
 
-    Error: second-order terms are neglected; rounding adds a few units. Flips that are uncertain within this
+    Error: second-order terms are neglected; rounding adds a few ulps. Flips that are uncertain within this
         error are not predicted. `good_until` returns the last step for which the forecast is valid.
     """
 

@@ -1,8 +1,7 @@
 """Repeat molecular-dynamics runs around a fork: find nearby atoms, override decisions, find minimal causes.
 
 To override a decision of run B, the decision of run A is imposed on B; B makes all other decisions itself.
-Bisection and delta debugging find the smallest set of atom pairs whose overridden decisions keep run B close
-to run A. The tool Verrou finds instructions that cause an error by delta debugging.
+The tool Verrou uses delta debugging to find the instructions that cause an error.
 """
 
 from __future__ import annotations
@@ -49,7 +48,7 @@ class Neighborhood:
 
 
 def neighborhood(fork: Fork) -> Neighborhood | None:
-    """Repeat both runs and return the atoms around the pair of atoms at the fork, or None without a pair."""
+    """Repeat both runs; return atoms near the pair at the fork, or None if the fork has no pair of atoms."""
     if fork.decision is None:
         return None
     program_a, program_b = fork.twin.a, fork.twin.b
@@ -152,7 +151,7 @@ def _check_pair(pair: tuple[int, int], atoms: int) -> None:
 
 
 def parse_pin(text: str, atoms: int) -> dict[str, Any]:
-    """Parse the text of imposed decisions, "fork", "3-75" or "3-75:600..700", into arguments of `pinned`.
+    """Parse a text that describes imposed decisions ("fork", "3-75", "3-75:600..700") for `pinned`.
 
     Raises:
         InputError: the text has none of these forms, or the pair of atoms does not exist.
@@ -300,7 +299,7 @@ class _Search:
                 self._positions[segment.first + row] = HostCell(segment.cell_of(row)), x
 
     def holds(self, keys: Sequence[int]) -> bool:
-        """Test if B stays near A with A's decisions on given atom pairs; False at the limit of runs."""
+        """Return whether B stays near A if these decisions are A's; False if no repeated runs are left."""
         name = frozenset(keys)
         if name not in self.known:
             if self.spent():
@@ -332,9 +331,9 @@ def _required(keys: list[int], search: _Search, until: int) -> list[int]:
     """Find a sufficient set of atom pairs by bisection, one necessary pair after another (QuickXplain).
 
     For n atom pairs, QuickXplain needs about log2(n) runs per necessary pair; delta debugging needs about n²
-    runs. The search assumes that more imposed decisions never cause a split. It stops after `until` runs.
+    runs. The search assumes that imposing more decisions never splits runs. It stops after `until` runs.
 
-    Source: Junker, QuickXplain, AAAI 2004.
+    Source: U. Junker, QuickXplain, AAAI 2004.
     """
     required: list[int] = []
     pool = keys

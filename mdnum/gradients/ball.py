@@ -294,7 +294,7 @@ class Frozen(BallMethod):
     def differentiate(self, problem: BallProblem, names: tuple[str, ...], progress: Any) -> Gradient:
         """Compute derivatives by reverse mode, and central differences at fixed decisions as a check.
 
-        Error: rounding in derivatives; relative error ~u^(2/3) (u: unit roundoff) in central differences.
+        Error: rounding of derivatives; relative error of central differences ~u^(2/3) (u: unit roundoff).
         """
         run = problem.run(keep=False)
         decisions = jax.tree.map(jnp.asarray, run.decisions())

@@ -49,7 +49,7 @@ class Cotangents:
 
 
 class Direction(NamedTuple):
-    """Derivatives of all inputs with respect to one parameter entry or (along the first axis) several."""
+    """Derivatives of all inputs with respect to one parameter entry, or several (along the first axis)."""
 
     # x, v: of the positions and velocities of step 0, user's order
     x: Float[Array, "*columns 3 atoms"]
@@ -76,8 +76,8 @@ def with_quantities(force: PairForce | ManyBodyForce, values: Any) -> PairForce 
 
 
 def onto_start(simulation: Simulation, start: Any, extra: Any) -> tuple[Any, Array, Array]:
-    """Propagate derivatives of the loss backward, from the extra state of step 0 (such as thermostat
-    variables) to the integrator's parameters and the initial positions and velocities.
+    """Propagate derivatives of the loss backward to the integrator's parameters, positions and velocities,
+    from the extra state of step 0 (such as thermostat variables).
 
     Args:
         start: the state of step 0.
@@ -127,7 +127,7 @@ def resolve(simulation: Simulation, words: Sequence[str]) -> tuple[str, ...]:
 
 
 def _places(simulation: Simulation, name: str) -> list[tuple[Callable[[Any], Any], Any]]:
-    """For each input that depends on a parameter, return a function that selects it, and its derivative."""
+    """Return a selector function and the derivative of each input that depends on a parameter."""
     if name in ("initial.positions", "initial.velocities"):
         return [((lambda of: of.x) if name == "initial.positions" else (lambda of: of.v), None)]
     v = simulation.velocities.T

@@ -1,9 +1,9 @@
 """Let JAX differentiate all operations of the steps in reverse mode, like `jax.grad` of the whole run.
 
 A chunk is a scan over a fixed number of steps with one neighbor list. Chunks of steps limit the memory that
-reverse mode needs. When the neighbor list expires, the remaining steps of the chunk are skipped. The host
-then builds the next neighbor list at the present positions. The states between chunks are stored. If memory
-is insufficient, every second state is dropped, and the steps between the remaining states are run again.
+reverse mode needs. If the neighbor list must be rebuilt, the remaining steps of the chunk are skipped. The
+host then builds the list at the present positions. The states between chunks are stored. If memory is
+insufficient, every second state is dropped, and the steps between the remaining states are run again.
 
 The differentiated program may round differently from an ordinary run, and then make other decisions. If
 decisions differ, the gradient belongs to another trajectory. Therefore, the states and decisions of all steps
@@ -298,7 +298,7 @@ class ChunkedProgram:
 
 @dataclass(frozen=True)
 class Unrolled(Method):
-    """Gradient method: derivative of the time steps, computed by JAX in reverse mode."""
+    """Gradient method: derivative of all operations of the time steps, computed by JAX in reverse mode."""
 
     # bytes of states that are kept, evenly spread; those between two of them are made again
     budget: int = KEPT
@@ -374,7 +374,7 @@ def marks(first: int, rows: range, x, v, bits, table: PairTable) -> Iterator[tup
 
 
 def departure(run: Mapping[int, Any], other: Mapping[int, Any]) -> dict[str, int | None]:
-    """Return the first steps at which states, and at which decisions, of two programs differ."""
+    """Return the first step at which two programs' states differ, and the first at which decisions differ."""
     both = sorted(run.keys() & other.keys())
     different = [[step for step in both if run[step][k] != other[step][k]] for k in (0, 1)]
     state, decision = (steps[0] if steps else None for steps in different)

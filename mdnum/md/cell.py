@@ -125,8 +125,8 @@ class Cell(eqx.Module):
     def minimum_image(self, x, y, z):
         """Return the components of the minimum image of a displacement.
 
-        The minimum image is correct if the nearest image is shorter than half the smallest perpendicular
-        width. Calling functions reject cutoffs longer than this half width.
+        The minimum image is correct if the distance to the nearest image is less than half the smallest
+        perpendicular width. Calling functions reject cutoffs longer than this half width.
         """
         if not any(self.pbc):
             return x, y, z
@@ -277,9 +277,9 @@ def wrap_positions(
 ) -> tuple[Float[np.ndarray, "atoms 3"], Int[np.ndarray, "atoms 3"]]:
     """Wrap positions, even from far outside the box; also return the numbers of lattice vectors subtracted.
 
-    Error: the first pass subtracts n * L, which is rounded. A second pass wraps positions that this rounding
-    left outside the box. A wrapped coordinate may equal the edge length L after L is added to a tiny negative
-    number.
+    Error: the first pass subtracts the product n * L, which is rounded. A second pass wraps positions that
+    the rounding of n * L left outside the box. A wrapped coordinate may equal the edge length L after L is
+    added to a tiny negative number.
     """
     wrapped = np.array(positions, np.float64, copy=True)
     images = np.zeros(wrapped.shape, np.int64)

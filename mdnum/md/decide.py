@@ -1,7 +1,7 @@
 """Decisions on which pairs are inside the cutoff, by the comparison that the system file specifies.
 
-The compared quantity and its threshold are defined only in this module. The force loop, the check of neighbor
-lists and the code that writes the ledger use this module. All decisions on a pair are therefore identical.
+Only this module defines the compared quantity and its threshold. The force loop, the check of neighbor lists
+and the writer of the ledger therefore make the same decision on each pair.
 """
 
 from __future__ import annotations
@@ -44,7 +44,7 @@ CONVENTIONS = ("r2 <", "r2 <=", "r <", "r <=")
 
 @dataclass(frozen=True)
 class PairDecider:
-    """Decision on a pair by the comparison `r2 < r_cut²`, `r2 <= r_cut²`, `r < r_cut` or `r <= r_cut`."""
+    """Decision whether a pair is inside: `r2 < r_cut²`, `r2 <= r_cut²`, `r < r_cut` or `r <= r_cut`."""
 
     r_cut: tuple[float, ...]  # cutoff of each pair type, length
     compare: str = "r2 <"  # quantity and comparison, one of "r2 <", "r2 <=", "r <", "r <="
@@ -63,7 +63,7 @@ class PairDecider:
 
     @property
     def space(self) -> str:
-        """The quantity that is compared: "r" or "r2"."""
+        """The quantity that is compared with the threshold: "r" (distance) or "r2" (squared distance)."""
         return self.compare.split()[0]
 
     @property
@@ -83,10 +83,10 @@ class PairDecider:
     def bounds(self) -> tuple[float, ...]:
         """Bounds on |computed margin - exact margin| by pair type, in units of the compared r or r².
 
-        The exact margin is that of the stored positions, with box and threshold in double precision. For the
-        error analysis, see numerics.rounding. The error bound is computed for a pair distance of 1.001 r_cut,
-        and holds for all shorter distances. For more distant pairs, the cutoff decision is correct, or
-        |margin| is below the bound. If coordinates exceed `reach`, `bounds_at` gives valid bounds.
+        The exact margin follows, without rounding, from stored positions and the double-precision box and
+        threshold. For the error analysis, see numerics.rounding. The error bound is computed for a pair
+        distance of 1.001 r_cut, and holds for shorter distances. For longer distances, the decision is right,
+        or |margin| is below the bound. If coordinates exceed `reach`, `bounds_at` gives valid bounds.
         """
         return tuple(float(bound) for bound in self._bounds(None))
 
@@ -97,7 +97,7 @@ class PairDecider:
         return narrows and len(self.reach.lattice) < 3
 
     def bounds_at(self, x: Float[np.ndarray, "rows 3 atoms"]) -> Float[np.ndarray, "rows types"]:
-        """Return error bounds of margins for several states, which are larger for coordinates beyond `reach`.
+        """Return error bounds of margins for several states; coordinates beyond `reach` have larger bounds.
 
         The rounding error of a position increases with its magnitude. Positions are not wrapped along
         nonperiodic axes.
@@ -147,7 +147,7 @@ class PairDecider:
         return thresholds[kind] - self.host_quantity(*displacement).astype(np.float64)
 
     def inside(self, quantity, value):
-        """Compare r or r² with thresholds; return True for pairs inside (jax or numpy arrays)."""
+        """Return True for pairs inside the cutoff, given r or r² and thresholds (jax or numpy arrays)."""
         return quantity <= value if self.compare.endswith("<=") else quantity < value
 
 
@@ -181,7 +181,7 @@ class Decisions(NamedTuple):
 
 
 def packed(halves: UInt8[Array, "groups atoms"]) -> UInt8[Array, "words atoms"]:
-    """Pack cutoff decisions into bytes; each byte contains those on two groups of neighbors."""
+    """Pack cutoff decisions into bytes; each byte contains the decisions on two groups of neighbors."""
     return halves[0::2] | (halves[1::2] << jnp.uint8(GROUP))
 
 
@@ -266,7 +266,7 @@ class SlotJudge:
 
 
 def displacements(components, cell: Cell, j):
-    """Return the components of minimum-image vectors x_j - x_i; padding indices become valid indices."""
+    """Return minimum-image vectors x_j - x_i by component; indices of empty slots become valid indices."""
     return cell.minimum_image(*(c.at[j].get(mode="promise_in_bounds") - c for c in components))
 
 
@@ -274,12 +274,12 @@ def displacements(components, cell: Cell, j):
 
 
 def zeros(shape: int | tuple[int, ...], dtype: Any) -> Array:
-    """Return zeros on the device; unlike jnp.zeros, no program is compiled for each shape."""
+    """Return zeros on the device, without compiling a program for each shape as jnp.zeros does."""
     return jax.device_put(np.zeros(shape, dtype))
 
 
 class Changes(NamedTuple):
-    """Changed decisions of several steps; each pair is stored once, at its first atom in sorted order."""
+    """Cutoff decisions that changed in several steps; each changed pair of atoms is stored only once."""
 
     # row, sorted atoms and whether inside now (plus 2 for each channel before), shape (room, 4)
     pairs: Int[Array, "room 4"]
@@ -303,7 +303,7 @@ class Changes(NamedTuple):
         return int(np.asarray(self.count)[0])
 
     def cut(self) -> Changes:
-        """Return buffers shortened to the changes found, to reduce the transfer to the host."""
+        """Return buffers shortened to the number of changes, to reduce the transfer of data to the host."""
         room = 1 << self.found.bit_length()
         if foreign.known() or room >= len(self.pairs):
             return self
@@ -320,7 +320,7 @@ class Changes(NamedTuple):
         row: Int[Array, ""],
         most: int,
     ) -> tuple[Changes, UInt8[Array, "words atoms"]]:
-        """Append the changed decisions to the buffers; return buffers and decisions, reusing their memory.
+        """Append changed decisions to the buffers; return the buffers and decisions, in the same memory.
 
         Args:
             most: largest number of changes recorded per step, on a device other than a CPU. If there are

@@ -166,8 +166,8 @@ class FixedPointDecider(PairDecider):
     """Decision whether a pair is inside the cutoff, by comparison of two integers.
 
     The squared distance is an integer in units of the squared position spacing. Every comparison is converted
-    to the form `r2 < limit` with an integer limit. For margins, the threshold is half a unit below the
-    integer limit. Margins are therefore never zero and have no rounding error.
+    to the form `r2 < limit` with an integer limit. Margins are measured from a threshold that is half a unit
+    below the integer limit. Margins are therefore never zero and have no rounding error.
     """
 
     spacing: float = 1.0  # of positions, length
@@ -236,7 +236,7 @@ class FixedPointStep(Integrator):
     zero: Int[Array, ""] = eqx.field(kw_only=True)  # an integer zero that XLA must not know
 
     def momentum(self, v: Float[Array, "3 atoms"], masses: Float[Array, "atoms"]) -> Float[Array, "3 atoms"]:
-        """Convert velocities to integer momenta; the conversion is exact for velocities of a simulation."""
+        """Convert velocities to integer momenta, without error for velocities of a fixed-point simulation."""
         return jnp.round(v * (masses / self.impulse))
 
     def velocity(self, p: Float[Array, "3 atoms"], masses: Float[Array, "atoms"]) -> Float[Array, "3 atoms"]:
@@ -244,7 +244,7 @@ class FixedPointStep(Integrator):
         return jnp.where(jnp.abs(p) < _LARGEST, p * (self.impulse / masses), jnp.nan)
 
     def kick(self, v, time, acceleration, masses):
-        """Return velocities after an acceleration acted for a time, with momenta rounded to integers."""
+        """Return velocities after an acceleration for a given time, with momenta rounded to integers."""
         push = jnp.round(time * acceleration * (masses / self.impulse))
         return self.velocity(self.momentum(v, masses) + push, masses)
 
@@ -287,7 +287,7 @@ class FixedPointVerlet(FixedPointStep):
 
 
 class FixedPointLangevin(FixedPointStep):
-    """Fixed-point Langevin integrator (BAOAB); the extra state stores the momentum bits lost to friction."""
+    """Fixed-point Langevin integrator (BAOAB); the extra state stores momentum bits removed by friction."""
 
     name = "langevin"
     keeps_momentum = False
@@ -450,7 +450,7 @@ class FixedPointJudge(SlotJudge):
         return d, r2, r2 < limit, limit
 
     def tally(self, nearest, quantity, inside, threshold):
-        """Return decisions on some neighbor-list slots, one bit each, and each atom's smallest |margin|."""
+        """Return the cutoff decisions on a group of neighbors as bits, and each atom's smallest |margin|."""
         bits = jnp.zeros(self.atoms, jnp.uint8)
         left = threshold - quantity
         away = jnp.maximum(left, 1 - left)

@@ -1,9 +1,9 @@
-"""Elementary functions made of IEEE 754 operations; results have the same bits unless operations are fused.
+"""Elementary functions made of IEEE 754 operations; all machines return the same bits if none is fused.
 
 Elementary functions differ between libraries, and between the instruction sets for which a compiler generates
 code. The functions of this module have no branch, no table and no fused multiply-add. Each function consists
-of sums, products, quotients, roots, comparisons, selections and bit operations. The result is the same number
-wherever a function is run operation by operation, as in the compiled force loop.
+of sums, products, quotients, roots, comparisons, selections and bit operations. A function gives the same
+result wherever its operations are executed one by one, as in the compiled force loop.
 
 Arguments and results are float64. Subnormal arguments are treated as 0. Results below 2.2261e-308 are 0, and
 results of exponentials and powers above 1.7976e308 are infinite. Errors are in ulps; an ulp is the spacing of
@@ -154,7 +154,7 @@ def log1p(x: Any) -> Any:
 
 
 def power(x: Any, y: Any) -> Any:
-    """Return x to the power y, an integer for x < 0. The error of the power is below 1.5 + |y|/40 ulp."""
+    """Return x**y, where y is an integer if x < 0. The error of x**y is below 1.5 + |y|/40 ulp."""
     size, huge = jnp.abs(x), 2.0**1000
     n, m = _split(size)
     # the logarithm in two parts: s and the sum that divides it lose what the second one has

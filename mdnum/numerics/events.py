@@ -49,8 +49,8 @@ class Hysteresis:
     """A decision with hysteresis (a Schmitt trigger), which turns on at one threshold and off at another.
 
     With one threshold, a quantity that fluctuates about the threshold flips the decision at each crossing. If
-    two thresholds differ by more than the noise, the decision flips only once. Similarly, a Verlet list with
-    a skin is rebuilt only when the skin is used up, not at every move.
+    the two thresholds differ by more than the fluctuation, the decision flips only once. Similarly, a Verlet
+    list with a skin is rebuilt only when the skin is used up, not at every move.
     """
 
     enter: Threshold  # where a no turns yes

@@ -249,11 +249,11 @@ class Conservation:
         kinetic: Float[np.ndarray, "rows"],
         least: float,
     ) -> Conservation | None:
-        """Compute fluctuation and drift of the conserved energy; None for few steps or atoms at rest.
+        """Compute fluctuation and drift of the conserved energy; None for too few rows or for atoms at rest.
 
         The linear trend of the energy is removed before the fluctuation is computed, since the drift is
-        reported separately. The first half of the run is omitted, because a run that starts from a lattice
-        turns half of its kinetic energy into potential energy.
+        reported separately. The first half of the run is omitted, because atoms that start on lattice sites
+        lose half of their kinetic energy to potential energy.
 
         Args:
             conserved: the energy that should be constant. kinetic: the kinetic energy.

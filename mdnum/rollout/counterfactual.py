@@ -25,7 +25,7 @@ class Counterfactual:
     """A run with its own arithmetic, on which the cutoff decisions of another run (the leader) are imposed.
 
     The run's own decisions are also computed, and those that differ from the leader's are counted. The object
-    is called with each segment of the leader. The method `until` returns the simulated time steps.
+    is called with each segment of the leader's run. The method `until` returns the simulated time steps.
 
     Args:
         simulation: the run whose arithmetic is used.

@@ -1,9 +1,9 @@
 """The file answers.json, which stores intermediate results so that a killed command can be resumed.
 
 A command with many tests (`audit`, `conform`) keeps its options and results in one dataclass of plain values.
-A result that should not be lost is written at once, and other results about once per second. A resumed
-command restores all values with their types, and runs the tests that have no result yet. The tables in the
-command's folder are created from the stored results.
+A result that should not be lost is written at once; other results are written about once per second. A
+resumed command restores all values with their types, and runs the tests that have no result yet. The tables
+in the command's folder are created from the stored results.
 """
 
 from __future__ import annotations

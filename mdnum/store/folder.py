@@ -191,7 +191,7 @@ class RunFolder:
         return self._layout
 
     def read_as(self, layout: Layout) -> None:
-        """Read a folder of an earlier version of mdnum with the present layout of its command."""
+        """Read this folder in the present format, even if an older version of mdnum has written it."""
         self._layout = layout
 
     @property
@@ -319,7 +319,7 @@ class RunFolder:
             stream.merge()
 
     def close(self) -> None:
-        """Close all files and release the lock; rows after the last checkpoint are lost."""
+        """Close all files and release the lock; rows appended after the last checkpoint are lost."""
         # also for one that began as the run was interrupted
         self._beside.shutdown()
         self._frames.close()
@@ -361,7 +361,7 @@ class RunFolder:
         return self._read_checkpoint()[0]
 
     def resume(self, layout: Layout | None = None) -> dict[str, Any]:
-        """Remove rows, frames and log lines after the last checkpoint; return the state of the checkpoint.
+        """Remove rows, frames and log lines written after the last checkpoint; return the saved state.
 
         Args:
             layout: new layout of the folder, if the command has added columns since the run began.
@@ -480,7 +480,7 @@ class RunFolder:
     def about(self) -> dict[str, Any]:
         """Metadata of the tables: version, kind, system, digest of the run, and the unit of each quantity.
 
-        The metadata do not depend on the time of writing, so resumed and unbroken runs write equal bytes.
+        The metadata do not depend on the time of writing; resumed and uninterrupted runs write equal bytes.
         """
         made, system = self._read_json("provenance.json"), self.system
         named = system.get("units") or system.get("world")

@@ -254,7 +254,7 @@ def _advice(
 
 
 def recommended(plan: Plan, advice: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
-    """Return two settings, of all recommended and of all converged values; an empty list if both are equal.
+    """Return two settings: all recommended values, and all converged values; an empty list if they are equal.
 
     Each choice was varied alone; runs with the two returned settings show the combined effect of all choices.
     """
@@ -281,7 +281,7 @@ def _together(
     means: Means, results: _Results, joint: Sequence[Setting],
     tolerances: Mapping[str, float],
 ) -> dict[str, Any]:  # fmt: skip
-    """Compare results for two settings: all recommended values together, all converged values together."""
+    """Compare results for two settings: with all recommended values, and with all converged values."""
     setting, end = joint
     found = _along(means, results, {"": setting}, end, list(tolerances))
     one = compared_with_end(setting, "", found, tolerances, len(tolerances))

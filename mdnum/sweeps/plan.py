@@ -23,7 +23,7 @@ Setting = tuple[str, ...]
 
 @dataclass(frozen=True)
 class Question:
-    """Arguments of a sweep, with the names and meanings of arguments of `mdnum.sweep`."""
+    """Arguments of a sweep; names and meanings are those of the arguments of `mdnum.sweep`."""
 
     seeds: int | Sequence[int] = 4
     measure: Sequence[str] | str = USUAL["md"]

@@ -219,7 +219,7 @@ def _validated(kind: type[Integrator], numbers: Mapping[str, Any], where: str) -
 
 
 def _check_instance(integrator: Integrator, units: Units, where: str) -> None:
-    """Check that the numbers of an integrator object are allowed in a system file (in its units).
+    """Check that an integrator's numbers, converted to system-file units, are allowed in a system file.
 
     Raises:
         InputError: a number is not a finite float64 scalar, or is out of range.

@@ -307,7 +307,7 @@ def _heated(simulation: Simulation, new: float) -> Simulation:
 
 
 class Entry(NamedTuple):
-    """The parameter to which a path refers, index of the array entry, and conversion factor of the unit."""
+    """Parameter to which a path refers, index of the array entry, and the factor that converts its unit."""
 
     whole: str  # path of the parameter
     index: tuple[int, ...] = ()  # which of its entries; empty for all of it

@@ -52,7 +52,7 @@ def host(values: Any, name: str, kinds: str = "fiu") -> np.ndarray:
 
 
 class ArrayFrames(Trajectory):
-    """Trajectory of frames that a program passes one by one; a frame is kept until the next is examined.
+    """Trajectory of frames that a program passes one by one; each is kept until the next one is examined.
 
     Args:
         name: name of the frames on a results page.
@@ -178,7 +178,7 @@ class ArrayFrames(Trajectory):
         return self._waiting[0]
 
     def sample(self) -> list[Frame]:
-        """Return the first frames of the trajectory that are available so far."""
+        """Return the first frames of the trajectory, or as many of them as are available so far."""
         return list(self._first)
 
     @contextmanager

@@ -96,7 +96,7 @@ class GivenList(NamedTuple):
         return _has(self.first, self.j, self.image, i, j, image, self.shifted)
 
     def missing(self, frame: Frame, pairs: Members) -> Int[np.ndarray, "pairs"]:
-        """Return the number of missing entries of each pair: at most 2 in a list with (i, j) and (j, i)."""
+        """Return the number of missing entries of each pair: up to 2 if a list has both (i, j) and (j, i)."""
         i, j, image, near = pairs.i, pairs.j, np.zeros(len(pairs), np.int64), pairs.rank == 0
         if self.shifted:
             image, near = _image(*image_shifts(frame, pairs).T), np.True_
@@ -273,7 +273,7 @@ class ListCheck:
         return bool((distance <= self._radii[self._kinds[i], self._kinds[j]] + placed.rounding).any())
 
     def ended(self, at: int, bound: float, stays: Mapping[Any, Any] | None = None) -> list[dict[str, Any]]:
-        """Return table rows of pairs that were missing until frame `at`; `stays` restricts the pairs."""
+        """Return table rows of pairs missing until frame `at` (only pairs in `stays`, if given)."""
         names = ("i", "j", "rank", "missing", "begin", "number", "deepest", "end")
         held = sorted((self._open if stays is None else stays).items())
         rows = [(*key, *told, at) for key, told in held if told[-1] > bound]

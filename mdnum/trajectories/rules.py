@@ -1,8 +1,8 @@
 """Membership rules, which define the neighbors of an atom and the margin of every decision.
 
 A membership rule is *symmetric* (i and j are neighbors of each other) or *directed* (j may be a neighbor of i
-although i is not a neighbor of j). Squared distances are compared in float64. Each rule defines the margin of
-a pair of atoms at distance r, a length that is positive for neighbors:
+although i is not a neighbor of j). Squared distances are compared in float64. Each rule has a different
+margin for two atoms at distance r; it is a length, positive for neighbors:
 
     CutoffRule      r_cut - r
     SpeciesCutoffs  r_cut of the two species - r

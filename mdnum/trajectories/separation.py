@@ -68,7 +68,7 @@ def same_lattice(one: Box, other: Box, tolerance: float) -> bool:
 def separation(
     one: Frame, other: Frame, atoms: AtomIndices = None, shift: Float[np.ndarray, "3"] | None = None
 ) -> Separation:
-    """Return the largest and the root mean square displacement between two frames, minus a common shift."""
+    """Return the largest and root mean square displacement between two frames, minus a common shift."""
     moved, whole = displacements(one, other, atoms, 0.0 if shift is None else shift)
     square = np.sum(moved**2, axis=1)
     at = int(np.argmax(square))
@@ -132,10 +132,10 @@ class FreeFlight(NamedTuple):
 
 
 def flight_of(start: Frame, end: Frame, step: float = 0.0) -> FreeFlight | None:
-    """Compare displacements between two frames with velocities; None without velocities or motion.
+    """Compare displacements with those predicted from velocities; None if there are no velocities or motion.
 
     `moved` is the ratio of measured to predicted displacements: about 1, or less if atoms turn around.
-    `factor`, the least-squares ratio, is about 1 if velocities have the right unit and keep their directions.
+    `factor`, the ratio by least squares, is about 1 if velocities have the right unit and keep direction.
     """
     if start.velocities is None or end.velocities is None or not end.time > start.time:
         return None

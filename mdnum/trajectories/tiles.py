@@ -83,7 +83,7 @@ class Tiles:
     flips: Changed  # room for them; images further than the nearest do not occur
 
     def serve(self, before: Placed, now: Placed, radius: float, clear: float) -> bool:
-        """Update the tiles to a frame; return True if they contain all pairs closer than radius + `clear`."""
+        """Update tiles to a new frame; return True if they contain all pairs closer than radius + `clear`."""
         if clear + 2.0 * self.doubt(now, radius) > self.clear:
             return False
         change = now.lattice.vectors - before.lattice.vectors
@@ -163,7 +163,7 @@ class Tiles:
 
 
 def _one_image(before: Placed, now: Placed, radius: float, moved: float) -> bool:
-    """Return True if no pair can have two images inside the cutoff, even if atoms approach by `moved`."""
+    """Return True if no pair can have two images inside the cutoff, even if two atoms approach by `moved`."""
     return bool((before.lattice.periodic == now.lattice.periodic).all()) and (
         now.lattice.narrowest >= 2.000002 * (radius + 8.0 * now.rounding) + moved
     )
@@ -424,7 +424,7 @@ def _follow(before, now, order, home, vectors, change, inverse, periodic, center
 
 @njit
 def _stays(boxes, around, drift):
-    """Return True if each cluster's box is at least `drift` inside its enlarged box on every side."""
+    """Return True if each cluster's box is inside its enlarged box, at least `drift` from every face."""
     out = 0
     for k in range(boxes.shape[0]):
         for c in range(3):

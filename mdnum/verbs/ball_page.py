@@ -47,7 +47,7 @@ class BallView(View):
 
     @property
     def located(self) -> bool:
-        """True if impacts are located within a step; the solver's counts are then impacts, not iterations."""
+        """True if impact times are computed within a step; the solver then counts impacts, not iterations."""
         return self.summary["integrator"] == "event-located"
 
     def first_step(self, reason: str) -> int:
@@ -146,7 +146,7 @@ def _nearest(view: BallView) -> Iterator[Plot]:
 
 
 def _ranges(view: BallView) -> Iterator[Any]:
-    """Yield a table of the range of each quantity, and of the first step at which narrower formats fail."""
+    """Yield a table: range of each quantity, and the first step at which narrower formats cannot hold it."""
     table = range_table(lambda name: TEXTS(f"range_{name}"), view.table("steps"))
     if table.rows:
         yield table

@@ -131,8 +131,8 @@ def structure_findings(system: System) -> Iterator[Finding]:
 def temperature_findings(start: float, requested: float, atoms: int, unit: str) -> Iterator[Finding]:
     """Yield a warning if the temperature of the velocities differs greatly from the requested temperature.
 
-    A ratio of temperatures up to three gives no warning, since an ideal crystal first loses half of its
-    kinetic energy. For few atoms, a temperature difference within the statistical scatter gives no warning.
+    A temperature ratio up to three gives no warning: an ideal crystal soon loses half of its kinetic energy.
+    For few atoms, a temperature difference within the statistical scatter gives no warning.
     """
     ratio = start / requested if requested > 0 else 1.0
     if 1 / _OTHER <= ratio <= _OTHER or abs(ratio - 1) <= 5 * math.sqrt(2 / (3 * atoms)):
@@ -143,7 +143,7 @@ def temperature_findings(start: float, requested: float, atoms: int, unit: str) 
 
 
 def would_show(report: Any, units: Units) -> Iterator[str]:
-    """Yield a sentence on each difference from other codes, and the value above which it is an error."""
+    """Yield a sentence on each difference from other codes, with the limit above which it is an error."""
     from mdnum.references.energy_check import FORCE, ROUNDINGS
 
     if frames := getattr(report, "frames", ()):

@@ -648,7 +648,7 @@ def _rule_told(
 def _counted(
     total: Statistics, motion: FrameMotion | None, flux: Mapping[str, Any] | None, reach: float | None
 ) -> dict[str, Any]:
-    """Return contact statistics as plain values, in frames; given `reach`, also estimate missed flips."""
+    """Return contact statistics (plain values, times in frames); with `reach`, also estimate missed flips."""
     from mdnum.trajectories.lost import lost_flips
     from mdnum.trajectories.statistics import Lifetime
 
@@ -689,7 +689,7 @@ def _words(table: AtomTable, atoms: np.ndarray) -> list[str]:
 
 
 def _as_asked(row: dict[str, Any], classes: Classes, groups: Groups) -> dict[str, Any]:
-    """Swap the two atom classes of a table row if they match the two selections only after the swap."""
+    """Swap the two atom classes in a table row, if this makes them match the order of the two selections."""
     if groups[0] is None or groups[1] is None:
         return row
     first, second = ({classes.names[at] for at in np.unique(classes.of[group])} for group in groups)

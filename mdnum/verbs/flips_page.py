@@ -105,7 +105,7 @@ def _ended(view: FlipsView) -> Iterator[Finding]:
 
 
 def _disagreeing(view: FlipsView, place: int) -> np.ndarray:
-    """Return frames whose pair count differs from the previous count plus pairs entered minus pairs left."""
+    """Return frames whose pair count is not the previous count plus pairs entered minus pairs left."""
     table = view.table("frames")
     rows = table["rule"] == place
     net = (table["entered"][rows] - table["left"][rows])[1:]

@@ -244,7 +244,7 @@ def _how(repeats: Mapping[str, Any]) -> str:
 
 
 def _repeated(subject: CalculatorSubject, atoms: Atoms, brief: bool = False) -> dict[str, Any]:
-    """Evaluate a structure repeatedly: with one calculator, after another structure, with new calculators."""
+    """Evaluate a structure repeatedly: by one calculator, after another structure, and by new calculators."""
     used = subject.fresh()
     aside = displaced(atoms, np.full((len(atoms), 3), 0.011))
     at_once, between, new = (2, 1, 2) if brief else (_AT_ONCE, _BETWEEN, _NEW)

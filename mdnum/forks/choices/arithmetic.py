@@ -115,7 +115,7 @@ class PrecisionChoice(Choice):
 
 @choice("reduction")
 class Summation(Choice):
-    """Another order of a sum: of the forces on an atom, or of the residuals that stop a solver."""
+    """Another order of a sum: of the forces on an atom, or of the residuals in a stopping criterion."""
 
     screened = " ".join(f"reduction={word}" for word in reductions.BY_NAME)
     shown = True
@@ -237,7 +237,7 @@ class Order(Summed):
 
 @choice("format")
 class FormatChoice(Summed):
-    """The forces of an atom's neighbors added in the order of another neighbor-list format."""
+    """Forces on each atom added in the order of neighbors in another neighbor-list format."""
 
     screened = "format=dense format=sparse format=ordered-sparse format=ordered-sparse@exact"
     shown = True
@@ -288,7 +288,7 @@ class Builder(Summed):
 
 @choice("skin")
 class Skin(Summed):
-    """Another skin: neighbor lists contain another number of pairs, and are rebuilt at other steps."""
+    """Another skin width: neighbor lists contain more or fewer pairs, and are rebuilt at other steps."""
 
     screened = "skin skin@exact"
     # of the skin; None for half as much again, or three quarters where the box has no room

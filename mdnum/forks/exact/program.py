@@ -1,4 +1,4 @@
-"""Run a simulation in exact real arithmetic. Interval arithmetic (Arb) proves every decision.
+"""Run a simulation in exact real arithmetic. Every decision is proven by interval arithmetic (library Arb).
 
 The initial state and all constants are the double-precision numbers of the simulation, treated as exact.
 Positions and velocities are represented by intervals ("balls") in multiple-precision arithmetic. A decision
@@ -120,7 +120,7 @@ class ExactHistory:
 
     @property
     def bits_per_step(self) -> float:
-        """Growth of the largest interval in the second half of a run, bits per step; NaN for short runs."""
+        """Growth of interval widths in the second half of a run, in bits per step; NaN for short runs."""
         rows = np.flatnonzero(np.isfinite(self.radius))
         if len(rows) < 4:
             return float("nan")
@@ -249,7 +249,7 @@ class ExactProgram:
         bits: int | None = None,
         progress: Callable[[int, int], None] | None = None,
     ) -> ExactHistory:
-        """Prove every decision up to a step, with more bits if the first attempt fails.
+        """Prove every decision up to a step; if an attempt fails, repeat with more bits of precision.
 
         Args:
             steps: last step.

@@ -1,9 +1,9 @@
 """Contribution of each flip to a gradient, and the parameter values at which pair decisions change.
 
 The contribution of a flip to a gradient is a product of two factors. The first factor, from a reverse pass,
-is the derivative of the loss with respect to the cutoff of one crossing. The first factor includes the effect
-of later flips. The second factor, from tangents without flips, is the derivative of the cutoff minus that of
-the pair distance. The contributions of single flips sum exactly to that of all flips.
+is the derivative of the loss with respect to the cutoff distance at this flip alone. This derivative includes
+the effect of later flips. The second factor, from tangents without flips, is the derivative of the cutoff
+distance minus that of the pair distance. The contributions of single flips add up to that of all flips.
 
 A decision boundary is a parameter value, between two adjacent floats, at which a pair decision changes.
 Between two boundaries all runs make the same decisions, and loss and gradient are smooth functions of the
