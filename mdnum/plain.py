@@ -15,12 +15,12 @@ T = TypeVar("T")
 
 @functools.cache
 def beside(module: str) -> dict[str, Any]:
-    """Return the tables of the TOML file next to a module (`__file__`), which callers must not change."""
+    """Return the tables of the TOML file next to a module (`__file__`); callers must not change them."""
     return tomllib.loads(Path(module).with_suffix(".toml").read_text(encoding="utf-8"))
 
 
 def shipped_folder(kind: Literal["systems", "demos"] = "systems") -> Path:
-    """Return the folder of shipped files: the packaged copy, or the repository for editable installs."""
+    """Return the folder of shipped files, which is in the repository for editable installs."""
     package = Path(__file__).parent
     packaged = package / f"_{kind}"
     return packaged if packaged.is_dir() else package.parent / kind
@@ -68,7 +68,7 @@ def plain(value: Any) -> Any:
 
 @dataclass_transform(frozen_default=True)
 def result(kind: type[T]) -> type[T]:
-    """Class decorator: frozen dataclass whose repr shows numbers, short texts, and types of other fields."""
+    """Make a class a frozen dataclass; its repr shows numbers, short texts, and types of other fields."""
 
     def __repr__(self: Any) -> str:
         values = ((one.name, getattr(self, one.name)) for one in dataclasses.fields(self))

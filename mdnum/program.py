@@ -1,8 +1,8 @@
-"""Interface through which analyses, such as forks and parameter maps, run and compare simulations.
+"""Interface by which analyses, such as the search for forks, run and compare simulations.
 
 Molecular dynamics, the bouncing ball and simulations of other packages implement the interface `Program`. An
 object with this interface, called a program, determines every bit of a run, including its initial state.
-Analyses such as forks and parameter maps use only the interface `Program`. Every time step takes its
+Analyses, such as the search for forks, use only the interface `Program`. Every time step takes its
 decisions, such as whether a pair is inside the cutoff, as input. The decisions of one program can therefore
 be recorded and imposed on another program. The implementations are `mdnum.rollout.program.MdProgram` and
 `mdnum.ball.program.BallProgram`.
@@ -84,7 +84,7 @@ class Program(Protocol):
         ...
 
     def nudged(self, size: float, count: int, seed: int) -> list[Any]:
-        """Return programs whose initial states have random displacements of about `size` or less."""
+        """Return programs whose initial states have random displacements of at most about `size`."""
         ...
 
     def decision(self, other: Any, flips: Sequence[Any], separation: float) -> Decision:
@@ -215,7 +215,7 @@ class Decision:
 
     @property
     def margin(self) -> float:
-        """Decision margin (threshold minus quantity) in run `run`, or in A if runs differ from the start."""
+        """Margin (threshold minus quantity) in run `run`, or in run A if the runs differ from the start."""
         return self.margins["A" if self.run == "start" else self.run]
 
     @property

@@ -115,7 +115,7 @@ def moved(typingctx: Any, source: Any, place: Any, shift: Any, out: Any, at: Any
 
 @intrinsic
 def kept(typingctx: Any, mask: Any, place: Any, labels: Any, first: Any, out: Any, at: Any) -> Any:
-    """Append to an array those of eight labels for which the mask is true; return the next free position."""
+    """Append to an array those of eight labels that a mask selects; return the next free position."""
 
     def generate(context: Any, builder: Any, signature: Any, args: Any) -> Any:
         bits, to = (_Vectors(context, builder, one.dtype, EIGHT) for one in (mask, labels))
@@ -141,7 +141,7 @@ def kept(typingctx: Any, mask: Any, place: Any, labels: Any, first: Any, out: An
 
 @intrinsic
 def turned(typingctx: Any, rows: Any, place: Any, apart: Any, out: Any, at: Any, across: Any) -> Any:
-    """Transpose a matrix of eight rows with eight numbers each.
+    """Transpose an 8 × 8 matrix.
 
     Args:
         place, apart: position of the first row, and distance between rows. at, across: the same for columns.
@@ -193,7 +193,7 @@ def near_box(typingctx: Any, atoms: Any, shift: Any, box: Any, reach: Any, out: 
 
 @intrinsic
 def near_atom(typingctx: Any, atom: Any, atoms: Any, low: Any, high: Any) -> Any:
-    """Return two bit masks of the atoms whose squared distance from one atom is below `low`, and `high`."""
+    """Return bit masks of the atoms whose squared distance from one atom is below `low`, and below `high`."""
 
     def generate(context: Any, builder: Any, signature: Any, args: Any) -> Any:
         atom, atoms, low, high = args

@@ -79,7 +79,7 @@ class Meter:
 
     @property
     def up(self) -> type[TimeUp] | None:
-        """`TimeUp` if the deadline has passed, `CallsUp` if no more calls are allowed, None otherwise."""
+        """Error class if a limit is reached (`TimeUp`: deadline, `CallsUp`: calculator calls), or None."""
         return TimeUp if self.deadline.passed else CallsUp if self.calls >= self.most else None
 
     @contextmanager

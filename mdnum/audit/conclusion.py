@@ -65,7 +65,7 @@ def to_come(results: Sequence[CheckResult], wanted: Sequence[str]) -> bool:
 
 
 def concluded(results: Sequence[CheckResult]) -> dict[str, str]:
-    """Return the text variants of findings whose text depends on the results of more than one check.
+    """Return which text applies to each finding that depends on the results of more than one check.
 
     Incorrect forces that do no work around closed loops are the gradient of another energy. Forces that do
     work around closed loops are not the gradient of any energy.

@@ -1,8 +1,8 @@
 """Iterative solvers: the loop, the rules that stop the loop, and derivatives of the loop.
 
 A stopping rule computes, from the residual of each ball, the quantity that is compared with a threshold. A
-sum over all balls couples independent balls, and its last bits depend on the order of summation. A separate
-stopping rule for each ball involves no sum over balls.
+sum over all balls couples independent balls. The last bits of the sum depend on the order of summation. A
+separate stopping rule for each ball involves no sum over balls.
 """
 
 from __future__ import annotations
@@ -44,7 +44,7 @@ class Reason(IntEnum):
 
 
 class Solve(NamedTuple):
-    """Record of one call of an iterative solver; shape (balls,) if each ball stops separately, else ()."""
+    """Record of one call of an iterative solver, with one entry per ball if each ball stops separately."""
 
     iterations: Int[Array, "..."]  # how often it went on
     reason: Int[Array, "..."]  # a `Reason`
@@ -249,9 +249,9 @@ def elementwise(function: Map) -> Map:
     """Return a version of a function with a `while_loop` that is differentiable in forward and reverse mode.
 
     JAX has no reverse mode for a `while_loop`, because the required memory is not known in advance. A
-    function that treats each ball separately has a diagonal Jacobian, which follows from a few tangents. The
-    tangents are computed in the loop, so iterations need not be stored. Decisions are held fixed in the
-    derivative. The record of the solve and the inputs in `rest` are not differentiated.
+    function that treats each ball separately has a diagonal Jacobian, which forward mode can compute. Forward
+    mode runs in the same loop, so iterations need not be stored. Decisions are held fixed in the derivative.
+    The record of the solve and the inputs in `rest` are not differentiated.
 
     Args:
         function: a function whose outputs for ball b depend only on the inputs for ball b (and on `rest`).

@@ -42,7 +42,7 @@ class World(eqx.Module):
     """Model of balls above a floor at height 0: all settings of a time step except the state.
 
     `World.create` checks all numbers and casts them to the dtypes in `policy`. Pass a `World` to jitted code
-    as an argument, not by closure, because the compiler may remove operations with a constant of zero.
+    as an argument: if its zeros are constants, the compiler may remove operations with these zeros.
 
     Attributes:
         contact: contact model of the floor.

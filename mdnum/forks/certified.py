@@ -115,7 +115,7 @@ def _cutoffs(decider: PairDecider) -> Float[np.ndarray, "types"]:
 def wider(twin: Twin) -> str | None:
     """Return the program that is more precise in at least one role and in no role less precise, or None.
 
-    Programs may differ only in the precision of roles: the effect of another time step is not rounding.
+    The programs may differ only in precision; another time step, for example, has effects beyond rounding.
     """
     a, b = twin.a.simulation, twin.b.simulation
     if twin.a.begin is not None or twin.b.begin is not None or _but_for_roles(a) != _but_for_roles(b):
@@ -207,8 +207,8 @@ def exact_margin(
     """Compute the margin of a pair without rounding errors, and the decision that results from the margin.
 
     The positions are the floating-point numbers of the state, taken as exact. The threshold and the lattice
-    vectors have double precision, as in the exact program, even if the run decides in another dtype. The
-    margin, expressed as a distance, is accurate to 400 binary digits; the decision is exact.
+    vectors have double precision, as in the exact program, even if the run uses another dtype for decisions.
+    The margin, expressed as a distance, is accurate to 400 binary digits; the decision is exact.
 
     Args:
         start, end: positions of the two atoms, length.

@@ -5,7 +5,7 @@ steps makes other decisions. This module therefore makes and records an ordinary
 
 A conservative force is a gradient, so its Jacobian J is symmetric: the transpose of J times a vector equals J
 times that vector. For a pair potential, J times a vector is a sum over neighbors, like the forces, and
-requires no scatter operation. For any other energy, J times a vector is the tangent of the energy's gradient.
+requires no scatter operation. For other energies, J times a vector is a directional derivative of the forces.
 Because the Jacobian is symmetric, reverse mode needs no record of the operations within a step.
 """
 

@@ -1,8 +1,8 @@
 """Call user-defined energy functions over a neighbor list in a uniform way, whatever their arguments are.
 
-Functions written for jax-md differ in the order of the arguments, the form of the box, real or fractional
-positions, neighbor lists with or without images, and the return value. The signature determines the order of
-the arguments. All other properties are determined by trial calls (`mdnum.systems.admission`).
+Functions written for jax-md differ in the order of the arguments, the form of the box, the kind of positions
+(real or fractional), the format of neighbor lists, and the return value. The signature determines the order
+of the arguments. All other properties are determined by trial calls (`mdnum.systems.admission`).
 """
 
 from __future__ import annotations
@@ -130,7 +130,7 @@ class Call:
 
 @jax.custom_jvp
 def _real_slope(x: Array, inverse: Array) -> Array:
-    """Return fractional coordinates, but differentiate as if they were real coordinates, like jax-md."""
+    """Return fractional coordinates that derivatives treat as real coordinates, as jax-md does."""
     return x @ inverse
 
 

@@ -128,7 +128,7 @@ def buffer(typingctx: Any, buffers: Any, k: Any) -> Any:
 
 @njit
 def asked_to_run(frame):
-    """Return True if XLA requests execution; answer a request for the version, and ignore all others."""
+    """Return True if XLA requests execution; answer version requests, and ignore other requests."""
     asked = peek(frame, 1)
     if asked != 0 and peek(asked, 1) & 0xFFFFFFFF == 1:
         # for which version of the interface was this written?

@@ -230,10 +230,10 @@ def multi_image(
 class PairSearch:
     """Neighbor search of jax-md for one cell, for repeated calls with new positions.
 
-    Positions are passed to jax-md as fractional coordinates in [0, 1), with the perpendicular widths as the
-    box. For positions outside the box, jax-md loses pairs without an error. The search also rejects some
-    valid triclinic boxes. After every search, the overflow flag is read outside jit. After an overflow, the
-    neighbor list is enlarged.
+    Positions are passed to jax-md as fractional coordinates in [0, 1), with the distances between opposite
+    faces as the box. For positions outside the box, jax-md loses pairs without an error. The search also
+    rejects some valid triclinic boxes. After every search, the overflow flag is read outside jit. After an
+    overflow, the neighbor list is enlarged.
 
     Args:
         cell: lattice vectors as rows, length.
@@ -266,7 +266,7 @@ class PairSearch:
         self._update = jax.jit(lambda folded, previous: previous.update(folded))
 
     def _frame(self, fractional: np.ndarray) -> None:
-        """Let [0, 1) cover the fractional coordinates of all atoms on nonperiodic axes, with a margin."""
+        """Choose origin and length of nonperiodic axes such that all fractional coordinates are in [0, 1)."""
         low, high = fractional.min(axis=0), fractional.max(axis=0)
         self._low = np.where(self.pbc, 0.0, low - self.r_list)
         self._span = np.where(self.pbc, 1.0, high - low + 2 * self.r_list)

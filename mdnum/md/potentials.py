@@ -322,7 +322,7 @@ class SumPotential(PairPotential):
 
 
 class Together(Cutoff):
-    """Cutoffs of terms that share one decision per pair; onsets, energies, slopes: one entry per term."""
+    """Cutoffs of terms with one common decision per pair; onsets, energies and slopes are given by term."""
 
     def __init__(self, ends: tuple[Cutoff, ...]):
         self.ends = ends

@@ -165,7 +165,7 @@ def _levels(terms, add, width: int):
 
 @dataclass(frozen=True)
 class Blocked(Reduction):
-    """A summation tree: each node adds `width` adjacent terms from left to right, like GPU thread blocks.
+    """A summation tree, as on GPUs: each node adds `width` adjacent terms from left to right.
 
     The error is at most gamma_{(width - 1) * levels} * sum |terms|. Width 2 gives the balanced tree. A width
     of at least the number of terms gives a sequential loop.

@@ -1,14 +1,14 @@
-"""Divergence of two runs that differ in one setting: start, growth rate, and whether flips are the cause.
+"""When two runs that differ in one setting diverge, how fast, and whether flips are the cause.
 
 A flip is a cutoff decision that differs between two runs. The verdict compares the second run with a
 counterfactual run. The counterfactual run has the arithmetic of the second run but the cutoff decisions of
 the first run. If the counterfactual run stays close to the first run, the flips caused the split. If the
-counterfactual run also splits, repeats of both runs decide whether the flips accelerated the split or are
-bystanders. Repeats are evaluated by a sequential sign test. Assume that a pair of runs splits later without
-the flips with a probability of at most 1/2. Then the probability that k or more of n pairs split later is at
-most that of k or more heads in n coin tosses. The initial displacements of all repeats have the same size. If
-the majority is different for displacements of another size, the verdict is left open. Error rates are listed
-in docs/verdict-calibration.md.
+counterfactual run also splits, repeats of both runs decide whether the flips made the split occur earlier.
+Repeats are evaluated by a sequential sign test. Assume that removing the flips delays the split of a pair of
+runs with a probability of at most 1/2. Then the probability that k or more of n splits are delayed is at most
+that of k or more heads in n coin tosses. The initial displacements of all repeats have the same size. If most
+repeats with displacements of another size disagree, there is no verdict. Error rates are listed in
+docs/verdict-calibration.md.
 """
 
 from __future__ import annotations
@@ -100,7 +100,7 @@ FEWEST = next(pairs for pairs in range(1, 2 + REPEATS) if looks(pairs)) - 1
 
 @dataclass(frozen=True)
 class Count:
-    """Numbers of pairs of runs that split later without the flips, and of pairs of runs that do not."""
+    """Numbers of pairs of runs for which removing the flips delays, or does not delay, the split."""
 
     pairs: int  # that were run, the pair itself among them
     later: int  # that were delayed by more than asked for
@@ -109,7 +109,7 @@ class Count:
 
     @property
     def needed(self) -> tuple[int, int] | None:
-        """Current or next stage of the sign test, if any: number of pairs of runs; how many must agree."""
+        """Current or next stage of the sign test: number of pairs of runs, and how many must agree."""
         return next((look for look in looks(self.most) if look[0] >= self.pairs), None)
 
     @property
@@ -129,7 +129,7 @@ class Count:
 
     @property
     def wanted_for_majority(self) -> int:
-        """Pairs of runs still needed to decide the majority if all agree; 0 if decided or impossible."""
+        """Smallest number of further pairs of runs that can decide the majority; 0 if none are needed."""
         if self.pairs < _ALIKE:
             return _ALIKE - self.pairs
         more = self.most // 2 + 1 - max(self.later, self.not_later)
@@ -212,7 +212,7 @@ class Growth:
 def growth_rate(log: Float[np.ndarray, "rows"]) -> tuple[float, float, bool]:
     """Return the growth rate of a quantity, its standard error, and whether growth is faster than linear.
 
-    The rate is the slope of the logarithm over the later data rows, with a standard error from blocks of
+    The rate is the slope of the quantity's logarithm in the later rows. The error is estimated from blocks of
     rows. The result is NaN, NaN, False if there are too few data rows, or if numbers are not finite.
     """
     rows = np.flatnonzero(np.isfinite(log))
@@ -306,7 +306,7 @@ def expected(
 
 @dataclass(frozen=True)
 class ForkVerdict:
-    """Verdict on whether flips caused the split of two runs, accelerated it, or were only bystanders."""
+    """Verdict on whether flips caused the split of two runs, made it occur earlier, or had no effect."""
 
     # "same" (no bit differs), "no fork" (no decision differs), "open" (no split within the horizon, or no
     # counterfactual that was followed far enough), "cause" (without the flips no split), "accelerated" (most
@@ -347,7 +347,7 @@ def judge(
     other: Sequence[Delay] = (),
     ended: Mapping[str, Any] | None = None,
 ) -> ForkVerdict:
-    """Return the verdict on whether flips caused or accelerated the split of a pair of runs.
+    """Return the verdict on whether flips caused the split of a pair of runs, or made it occur earlier.
 
     Args:
         dates: steps at which the pair of runs diverges.
@@ -398,7 +398,7 @@ def _counted(
 ) -> ForkVerdict:
     """Return the verdict on runs that split despite imposed decisions, from the count of delayed splits.
 
-    Repeats with a displacement of another size can only withdraw a verdict and thus add no false verdicts.
+    Repeats with displacements of another size can only withdraw a verdict, so they add no false verdicts.
     """
     pair = delays[0][0]
     threshold = 0.0 if rate is None else E_FOLDINGS / rate
@@ -516,7 +516,7 @@ class Share:
 
 
 def table(series: Mapping[str, Shaped[np.ndarray, "steps"]], tolerance: float) -> tuple[SplitCell, ...]:
-    """For each combination of the arithmetic and decisions of A and B, return when it splits from A and B.
+    """Return when runs with the arithmetic of A or B and the decisions of A or B split from A and from B.
 
     Args:
         series: separations at each step, length, by the names "B" and those in SERIES; NaN after a run ended.
@@ -541,7 +541,7 @@ def table(series: Mapping[str, Shaped[np.ndarray, "steps"]], tolerance: float) -
 
 
 def shares(cells: tuple[SplitCell, ...], rate: float) -> tuple[Share, ...]:
-    """Return by how many steps decisions and arithmetic advance a split, with runs A and B as references.
+    """Return by how many steps different decisions, or arithmetic, make the split of runs A and B earlier.
 
     Args:
         cells: result of `table`.

@@ -159,7 +159,7 @@ _NUMBERS = ("potential", "kinetic", "virial", "heat", "work", "nearest", "moved"
 
 
 class EpochOutcome(NamedTuple):
-    """State, flags and decisions at the end of the compiled loop."""
+    """State, status flags and cutoff decisions at the end of the compiled loop."""
 
     state: EpochState  # where to go on
     # four numbers that travel together: how many rows were recorded; whether the list must be rebuilt before

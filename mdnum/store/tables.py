@@ -373,7 +373,7 @@ def together(parts: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
 
 
 def _repeats(values: Any, value: Any) -> bool:
-    """Return True if a column is stored as a single value that equals the given value."""
+    """Return True if a column consists of one repeated value, stored once, that equals the given value."""
     if isinstance(values, np.ndarray) and values.strides == (0,):
         values = values[0]
     return value is not None and np.ndim(values) == 0 and bool(values == value)

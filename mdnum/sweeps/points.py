@@ -8,10 +8,10 @@
         series.parquet                values at each step
       claims/ADDRESS.N                the process that is computing it
 
-The address of a point is defined as in signac: the MD5 hash of the state point as JSON. A point is computed
-in a temporary folder, which a single rename moves to the address. A killed process therefore leaves no
-partial result. To claim a point of a sweep, a process creates a file with O_EXCL, so that only one process
-succeeds. If the claiming process ends without a result, another process creates a claim with the next number.
+The address (folder name) of a point is the MD5 hash of its state point as JSON, as in signac. A point is
+computed in a temporary folder, which is then renamed. A killed process therefore leaves no partial
+result. To claim a point of a sweep, a process creates a file with O_EXCL, so that only one process succeeds.
+If the claiming process ends without a result, another process creates a claim with the next number.
 """
 
 from __future__ import annotations

@@ -123,7 +123,7 @@ class Simulation:
 
     @property
     def file(self) -> System | None:
-        """System file that describes the simulation, or None if it was changed or made from objects."""
+        """System file that describes the simulation; None if no file describes the simulation exactly."""
         its = self.origin.parts
         same = bool(its) and all(getattr(self, name) is part for name, part in its.items())
         return self.origin.system if same else None
@@ -148,7 +148,7 @@ class Simulation:
 
     @property
     def imposable(self) -> bool:
-        """True if a run can use another run's decisions, False if the energy function applies a cutoff."""
+        """Whether cutoff decisions can be imposed; False if the energy function applies its own cutoff."""
         return self.pairwise or self.model.trusts_list
 
     @property
@@ -235,7 +235,7 @@ class Simulation:
         return len(self.decider.r_cut) // self.channels
 
     def type_of(self, i, j) -> Int[np.ndarray, "..."]:
-        """Return the index of the cutoff radius for each pair of atoms, by species and by group of terms.
+        """Return, for each pair of atoms, an index that depends on both species and the channel (cutoff).
 
         Args:
             i: index of the first atom, plus the number of atoms times the index of the channel.
@@ -246,27 +246,27 @@ class Simulation:
         return channel * self.pair_types + pair_type(self.species[i], self.species[j], len(self.symbols))
 
     def first_atoms(self, i: Any) -> dict[str, Any]:
-        """Return the first atom of each pair, and the potential term if terms decide separately."""
+        """Return the first atom of each pair, and the potential term if each term has its own decisions."""
         if self.channels == 1:
             return {"i": i}
         channel, i = np.divmod(np.asarray(i, np.int64), self.atoms)
         return {"i": i, **self.terms_of(channel * self.pair_types)}
 
     def terms_of(self, kind: Any) -> dict[str, Any]:
-        """Return a table column with each decision's potential term; no column if terms share decisions."""
+        """Return a table column with each decision's potential term; no column if there is one channel."""
         if self.channels == 1:
             return {}
         names = np.array([part.potential.name for part in self.model.parts])
         return {"terms": names[kind // self.pair_types]}
 
     def pair_of(self, i: int, j: int) -> dict[str, Any]:
-        """Return a table row with both atoms of a pair, and the potential term if terms decide separately."""
+        """Return a table row with both atoms of a pair, and the term if each term has its own decisions."""
         return {key: np.asarray(one).item() for key, one in self.first_atoms(i).items()} | {"j": int(j)}
 
     def jumps(self) -> tuple[Float[np.ndarray, "kinds"], Float[np.ndarray, "kinds"]]:
         """Return the jumps of energy and radial force at the cutoff, for each type of cutoff decision.
 
-        If atoms have weights, the largest absolute jumps of any pair are returned; see also `jumps_of`.
+        If atoms have weights, the result is an upper bound on the absolute jumps of any pair of atoms.
         """
         if not self.pairwise:
             smoothness = self.model.smoothness
@@ -286,7 +286,7 @@ class Simulation:
         return np.stack([np.asarray(own[0]) if own else np.ones(self.atoms) for own in each])
 
     def jumps_of(self, i, j) -> tuple[Float[np.ndarray, "pairs"], Float[np.ndarray, "pairs"]]:
-        """Return the jumps of energy and radial force when atoms i (see `type_of`) and j enter the cutoff."""
+        """Return the jumps of energy and radial force at the cutoff for atoms i (see `type_of`) and j."""
         kind, weights = self.type_of(i, j), self._weights
         if weights is None:
             energy, force = (jump[kind] for jump in self.jumps())
@@ -350,7 +350,7 @@ class Simulation:
     def with_cutoff(self, cutoff: str | Cutoff) -> Simulation:
         """Return the system with another kind of cutoff; the cutoff radius remains the same.
 
-        The onset of switching is kept; if the previous cutoff did not switch, the onset is 0.9 of the radius.
+        The onset of the switching function is kept; if there was none, the onset is 0.9 of the cutoff radius.
         """
         made = CUTOFFS.parse(cutoff) if isinstance(cutoff, str) else cutoff
         return self._ended(lambda _: made)
@@ -379,7 +379,7 @@ class Simulation:
         return replace(self, policy=policy, decider=decider, fixed_point=None)
 
     def in_row(self, cell: Cell | None) -> Simulation:
-        """Return the system with the box at a given step, or unchanged if the box is constant."""
+        """Return the system with the box of a given step, or the system itself if the box is constant."""
         return self.with_cell(jax.tree.map(np.asarray, cell)) if self.integrator.moves_cell else self
 
     def with_cell(self, cell: Cell) -> Simulation:

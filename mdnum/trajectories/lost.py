@@ -67,7 +67,7 @@ class FrameMotion:
         *,
         timed: bool = True,
     ) -> FrameMotion | None:
-        """Measure the displacements over successive frames; None for too few frames or too little motion."""
+        """Measure displacements between frames; return None if frames are too few or atoms hardly move."""
         sides = [slice(None) if one is None else one for one in (first, first if second is None else second)]
         atoms, grid = min(len(sample[0].positions[side]) for side in sides), resolution.usual_step(sample[0])
         pairs = list(pairwise(sample))
@@ -109,7 +109,7 @@ class LostFlips:
 def lost_flips(
     found: Strides, motion: FrameMotion | None = None, flux: Any = None, reach: float = math.nan
 ) -> LostFlips | None:
-    """Estimate the flips missed between frames; None for fewer than three frame intervals, or for no flips.
+    """Estimate the missed flips; return None if no flips, or fewer than three frame intervals, are given.
 
     Args:
         found: number of flips found at each stride.
@@ -171,7 +171,7 @@ def _of_thinning(found: Strides) -> Estimate:
 
 
 def _carried_on(taken: Float[np.ndarray, "doublings"], error: Float[np.ndarray, "doublings"]) -> Estimate:
-    """Estimate the fraction of flips missed in successive frames, from flips found if frames are skipped."""
+    """Estimate the fraction of flips missed between frames from the flips found if frames are skipped."""
     misfit = sum(((law - one) / off) ** 2 for law, one, off in zip(_TAKEN, taken, error, strict=False))
     weight = np.exp(np.min(misfit) / 2 - misfit / 2 - _RARE)
     mean = float(np.average(_LOST, weights=weight))

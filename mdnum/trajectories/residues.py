@@ -1,8 +1,8 @@
 """Contacts between residues: two residues are in contact if any pair of their atoms is within the cutoff.
 
-Decisions are made for pairs of atoms; the ledger contains the smallest distance between atoms of the two
-residues. Hydrogens and virtual sites are excluded by default, because their positions depend on constraints
-and on the program that wrote the file. Customary contact cutoffs are defined for heavy atoms.
+Decisions are made for pairs of atoms. The stored distance of two residues is the smallest distance between
+their atoms. Hydrogens and virtual sites are excluded by default, because their positions depend on
+constraints and on the program that wrote the file. Customary contact cutoffs are defined for heavy atoms.
 """
 
 from __future__ import annotations
@@ -105,7 +105,7 @@ class ResidueTracker:
     """Tracker of contacts between residues, with the same interface as `Tracker` for pairs of atoms.
 
     Pairs of atoms within one residue are ignored. `near` counts atom pairs whose distance equals the cutoff
-    within rounding error, at least one for each pair of residues. The attribute `min_margin` is always inf.
+    within rounding error; two residues may have several such pairs. The attribute `min_margin` is always inf.
 
     Args:
         rule: membership rule for atoms.
@@ -220,7 +220,7 @@ def _by_residue(atoms: np.ndarray | None, of: np.ndarray, count: int) -> tuple[n
 
 @dataclass(frozen=True)
 class Occupancy(Columns):
-    """Fraction of the frames in which each residue pair was in contact, sorted by (i, j): a sparse matrix."""
+    """Sparse matrix of the fraction of frames in which residues i and j were in contact, sorted by (i, j)."""
 
     i: Int[np.ndarray, "pairs"]  # the pair
     j: Int[np.ndarray, "pairs"]

@@ -1,7 +1,7 @@
 """Searches for pairs within a distance and for nearest neighbors in a frame; comparison of two frames.
 
-Distances in a search contain the rounding error of wrapped coordinates. A pair of atoms close to its
-threshold is decided from the stored coordinates (`lattice.square_of`), so all search algorithms agree.
+Distances in a search contain the rounding error of wrapped coordinates. Distances close to a threshold are
+recomputed from stored coordinates (`lattice.square_of`), so all search algorithms find the same pairs.
 """
 
 from __future__ import annotations
@@ -117,7 +117,7 @@ def search(
 
 @njit(inline="always")
 def exact_square(x, home, i, j, n0, n1, n2, vectors):
-    """Return the squared distance that decides on a pair of atoms; n is the image shift of j after wrapping.
+    """Return the squared distance to compare with the threshold; n is the image shift of j after wrapping.
 
     The squared distance is bitwise the same if atoms are exchanged: only signs of rounded numbers change.
     """
@@ -127,7 +127,7 @@ def exact_square(x, home, i, j, n0, n1, n2, vectors):
 
 @njit
 def _settle(x, atoms, kind, square, radius, bound, found):
-    """Decide pairs of atoms near their thresholds from stored coordinates; return the smallest |margin|.
+    """Determine from stored coordinates which pairs near thresholds are inside; return smallest |margin|.
 
     In a directed search, the squared distances in `found.value` are recomputed from stored coordinates.
     """
@@ -253,7 +253,7 @@ def nearest(
 def _choose(
     rows, made, own, centers, both, most, reach, bound, complete, searched, last_in, first_out, lacking
 ):  # fmt: skip
-    """Keep nearest neighbors; return numbers kept and uncertain, smallest |margin|, and incomplete rows."""
+    """Keep the nearest neighbors of each center; return several counts and the smallest |margin|."""
     written, close, smallest, short = 0, 0, np.inf, 0
     for i in range(rows.first.shape[0]):
         if not centers[i]:

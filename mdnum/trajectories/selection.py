@@ -1,4 +1,4 @@
-"""Selection of atoms in MDAnalysis's selection syntax, for trajectories from any reader."""
+"""Selection of atoms in any supported trajectory format, in the selection syntax of MDAnalysis."""
 
 from __future__ import annotations
 

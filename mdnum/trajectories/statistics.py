@@ -4,8 +4,8 @@ Three quantities describe the durations of contacts:
 
 - The **lifetime** is estimated from contacts whose beginning was observed. Contacts that continue after the
   last frame are right-censored (Kaplan and Meier, J. American Statistical Association 53, 457, 1958).
-- The **mean by rate** is the total contact time divided by the number of times that a pair left. The mean by
-  rate includes partly observed contacts, and equals the mean lifetime if pairs leave at a constant rate.
+- The **mean by rate** is the total contact time divided by the number of observed contact ends. The mean by
+  rate includes partly observed contacts, and equals the mean lifetime if contacts end at a constant rate.
 - The **residence** at a lag is the fraction of the pairs in contact at a frame that stay in contact during
   the lag (Impey, Madden and McDonald, J. Phys. Chem. 87, 5071, 1983). Long contacts are sampled more often,
   so the residence differs from the lifetime.
@@ -114,9 +114,9 @@ def survival(found: Durations) -> Survival:
 
 
 def mean_by_rate(found: Durations) -> tuple[float, float]:
-    """Return the mean contact time per departure, in frames, and its standard error; inf if no pair left.
+    """Return total contact time per contact end, in frames, and its standard error; inf if no contact ended.
 
-    The standard error is valid for independent departures; repeated crossings make the true error larger.
+    The standard error is valid for independent contact ends; repeated crossings make the true error larger.
     """
     if not found.leaves:
         return float("inf"), float("nan")
@@ -247,7 +247,7 @@ class ClassTally(Sums):
 
     @property
     def mean_stay(self) -> Float[np.ndarray, "classes classes"]:
-        """Mean number of frames in contact per departure, by pair of classes; nan if no pair left."""
+        """Frames in contact divided by contact ends, for each pair of classes; nan if no contact ended."""
         none = np.full(self.left.shape, np.nan)
         return np.divide(self.exposure, self.left, out=none, where=self.left > 0)
 
@@ -374,7 +374,7 @@ class Statistics(Sums):
     def of(
         cls, history: History, labels: Labels, directed: bool, window: int, before: Statistics | None = None
     ) -> tuple[Statistics, Contacts]:
-        """Add statistics of the pairs in `history` to `before`; return the sum and these pairs' contacts.
+        """Add the statistics of pairs in `history` to `before`; return the sum and the contacts in `history`.
 
         A flip reversed within `window` frames is counted as chatter. A contact with an absence of up to
         `window` frames counts as one intermittent contact.
@@ -405,7 +405,7 @@ class Statistics(Sums):
         return counted if before is None else before + counted, stays
 
     def curves(self, pairs: Int[np.ndarray, "frames"], interval: float) -> dict[str, np.ndarray]:
-        """Return table columns of survival and residence by lag; `pairs` is the number of pairs per frame.
+        """Return survival and residence by lag as table columns; `pairs` counts contacts at each frame.
 
         `interval` is the time between frames, nan if unknown.
         """
@@ -428,7 +428,7 @@ class Statistics(Sums):
 
 @dataclass(frozen=True)
 class Lifetime:
-    """Median, mean and other measures of contact lifetimes, in frames; a value not determined is None."""
+    """Median, mean and other measures of contact lifetimes, in frames; None for measures that are unknown."""
 
     followed: int  # contacts seen to begin
     median: int | None  # frames after which so many are over
@@ -453,7 +453,7 @@ class Lifetime:
 
 
 def lags_of(frames: int) -> Int[np.ndarray, "lags"]:
-    """Return the lags of correlation functions, in frames: all small lags, then increasing spacing."""
+    """Return lags of correlation functions, in frames: consecutive at first, then at increasing spacing."""
     if frames < 2:
         return np.zeros(1, np.int64)
     return np.unique(np.concatenate([[0], np.round(np.geomspace(1, frames - 1, _POINTS))]).astype(np.int64))

@@ -268,7 +268,7 @@ def _digits(values: Iterable[Any], least: int) -> int:
 
 
 def shown(value: Any, digits: int = 10) -> str:
-    """Format a plain value as text: numbers with the given significant digits, lists in brackets."""
+    """Format a plain value as text: numbers with at most `digits` significant digits, lists in brackets."""
     if isinstance(value, Mapping):
         return ", ".join(f"{str(key).replace('_', ' ')} {shown(item, digits)}" for key, item in value.items())
     if isinstance(value, list):

@@ -78,7 +78,7 @@ def fork_map(
     workers: int | None = None,
     **keep: Unpack[Keep],
 ) -> Outcome:
-    """Find parameter values at which decisions of a run change, each value between two adjacent floats.
+    """Find parameter values, each between two adjacent floats, at which decisions of a run change.
 
     Example:
         >>> mdnum.fork_map("argon/crystal-108", "cutoff.radius", 1.58, 1.59, steps=100)
@@ -331,7 +331,7 @@ def _with_unit(text: str, unit: str) -> str:
 def fork_forecast(
     system: Simulation | System | str | Path, size: float, *, steps: int | None = None, **keep: Unpack[Keep]
 ) -> Outcome:
-    """Predict, from one tangent run, which decisions change first if initial positions change randomly.
+    """Predict from one run's derivatives which decisions change first if initial positions change randomly.
 
     Example:
         >>> mdnum.fork_forecast("argon/liquid-864", 1e-9)
@@ -379,7 +379,7 @@ def fork_forecast(
 
 
 def judge_forecast(view: View) -> Verdict:
-    """Return the verdict on a forecast: decisions expected to change first, and last step of its validity."""
+    """Return the verdict on a forecast: decisions expected to change first, and how long it is valid."""
     s, unit = view.summary, view.units.length
     first, nearest, until, ends = s["first"], s["nearest"], s["until"], s["ends"]
     values = {**s, "unit": unit, "after": until + 1}

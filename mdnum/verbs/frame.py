@@ -94,7 +94,7 @@ class View:
         return self._tables[name]
 
     def kept(self, codes: Mapping[str, Any]) -> list[Finding]:
-        """Return the stored findings whose codes are not in `codes`; they come from other modules."""
+        """Return the stored findings of other modules, which are those whose codes are not in `codes`."""
         found = self.summary.get("findings") or ()
         return [restore(each) for each in found if each.get("code") not in codes]
 

@@ -31,7 +31,7 @@ _GROWN = {"forward bounded, gradient not": "growing", "forward not bounded": "un
 
 
 def by(summary: Mapping[str, Any], method: str) -> Mapping[str, Any] | None:
-    """Return the stored result of a gradient method, or of the closed form if used as the reference."""
+    """Return the stored result of a gradient method, or of the closed form that serves as the reference."""
     if summary.get("exact") and method == summary["reference"]:
         exact = {"gradient": summary["exact"], "details": {}, "error": {}}
         return {"method": method, "description": TEXTS("exact"), **exact}
@@ -61,7 +61,7 @@ def digits_note(summary: Mapping[str, Any], name: str) -> str:
 
 
 def resolved(summary: Mapping[str, Any], name: str, value: float | None, most: int) -> str:
-    """Format one entry of a derivative with its valid digits, at most `most` digits.
+    """Format one entry of a derivative, rounded to its valid digits but to at most `most` digits.
 
     Scientific notation is used if trailing zeros could be mistaken for valid digits.
     """

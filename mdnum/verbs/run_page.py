@@ -73,7 +73,7 @@ class RunView(View):
 
     @property
     def cutoff(self) -> Mapping[str, Any]:
-        """Kind, radius and comparison of the cutoff, energy and force jumps; empty without a cutoff."""
+        """Properties of the cutoff, such as its kind, radius and energy jump; empty if there is no cutoff."""
         return self.summary.get("cutoff") or {}
 
     @property
@@ -84,7 +84,7 @@ class RunView(View):
 
     @property
     def own_end(self) -> list[str]:
-        """Variant of a remedy's text: "own" if the potential sets the cutoff, otherwise none."""
+        """Variant of a remedy's text: ["own"] if the potential sets the cutoff, otherwise an empty list."""
         return [] if self.cutoff_key else ["own"]
 
     @cached_property
@@ -114,7 +114,7 @@ class RunView(View):
 
     @cached_property
     def budget(self) -> dict[str, np.ndarray]:
-        """Change of the conserved energy, cumulative energy jumps of flips, and their difference."""
+        """By step: change of the conserved energy, sum of the energy jumps at flips, and change minus sum."""
         conserved = self.series["conserved"]
         change, jumps = conserved - conserved[0], np.cumsum(self.series["energy_jump"])
         return {"change": change, "jumps": jumps, "residual": change - jumps}
@@ -124,9 +124,9 @@ class RunView(View):
         """Indicators of whether the time step is small enough; unknown indicators are None.
 
         `per_period` is the number of steps per period of the fastest vibration in the first and the last
-        frame. `fluctuation` is the ratio of the fluctuations of the conserved energy (without the jumps of
-        flips) and of the kinetic energy. `drift` and `drift_error` are the drift of the conserved energy and
-        its error, in k_B T per atom.
+        frame. `fluctuation` is the fluctuation of the conserved energy (without the energy jumps at flips)
+        divided by that of the kinetic energy. `drift` and `drift_error` are the drift of the conserved energy
+        over the whole run and its standard error, in k_B T per atom.
         """
         period, step = self.summary.get("fastest_period"), (self.system.get("dynamics") or {}).get("timestep")
         atoms = self.summary.get("atoms") or 0
@@ -146,13 +146,13 @@ class RunView(View):
 
     @property
     def residual(self) -> Measured:
-        """Residual of the energy budget, as stored by the run or as max |E(t) - E(0) - sum of jumps|."""
+        """Stored residual of the energy budget or, if missing, max |E(t) - E(0) - sum of energy jumps|."""
         stated = self.summary.get("energy_budget_residual")
         left = float(np.max(np.abs(self.budget["residual"]))) if stated is None else abs(float(stated))
         return Measured(left, self.units.energy, self.summary.get("energy_budget_tolerance"))
 
     def total(self, key: str, column: str | None = None) -> int:
-        """Return a count for the whole run: from the summary or, if missing, the sum over neighbor lists."""
+        """Return a number of events, such as lost pairs, from the summary or summed over neighbor lists."""
         return int(self.summary.get(key) or self.epochs[column or key].sum())
 
     def step(self, row: int | np.integer) -> int:
@@ -443,7 +443,7 @@ def _nearest(run: RunView) -> Iterator[Any]:
 
 
 def _ranges(run: RunView) -> Iterator[Any]:
-    """Yield a table of quantities' ranges, and when they first exceed narrower floating-point formats."""
+    """Yield a table of each quantity's range, and of the first step outside the range of narrower formats."""
     examined, series, units = run.table("ranges"), run.series, vars(run.units)
     sums = columns({name: series[name][:, None] for name in ("potential", "kinetic")})
     sums["step"] = series["step"]

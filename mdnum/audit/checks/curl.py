@@ -153,7 +153,7 @@ def around(
 ) -> Loop:
     """Compute the work of the forces on the circle x + radius (u cos t + v sin t), with orthonormal u and v.
 
-    Error: estimated from the force noise, and from the work with half or a third of the points of the circle.
+    Error: the error is estimated from the force noise, and from the work with half or a third of the points.
     """
     angles = 2 * np.pi * np.arange(_POINTS) / _POINTS
     forces = [

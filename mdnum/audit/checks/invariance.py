@@ -273,7 +273,7 @@ class _Judge:
 
 
 def _refusals(refused: list[tuple[Same, CalculatorError]]) -> Iterator[Observed]:
-    """Yield findings about nonfinite results, and about basic representations that the calculator rejects."""
+    """Yield findings about nonfinite results, and about exceptions for structures that must be supported."""
     empty = [one for one in refused if one[1].cause is None]
     raised = [one for one in refused if one[1].cause is not None and one[0].code in _MUST_ANSWER]
     for code, cases in (("NOT_FINITE", empty), ("FAILS", raised)):

@@ -227,7 +227,7 @@ def _certify_ball(system: BallSystem, last: int, policies: Mapping[str, Roles], 
 
 
 def _steps_per_bit(rows: list[PolicyHorizon]) -> float:
-    """Return the number of steps in which the deviation doubles, from the run with the longest growth fit."""
+    """Return the number of steps in which the deviation doubles, from the fit that covers the most steps."""
     # separations that grow by a power of time, as those of a lone pair, are no exponentials
     fits = [row.growth for row in rows if row.growth is not None]
     fits = [fit for fit in fits if fit.rate > 0 and fit.r_squared > _EXPONENTIAL]
@@ -237,7 +237,7 @@ def _steps_per_bit(rows: list[PolicyHorizon]) -> float:
 
 
 def _with_gains(rows: list[PolicyHorizon], last: int) -> list[PolicyHorizon]:
-    """For each policy, add the steps gained over single precision, relative to double precision."""
+    """Add each policy's gain in steps over single precision, divided by the gain of double precision."""
     low = next((row for row in rows if row.is_all("float32")), None)
     high = next((row for row in rows if row.is_all("float64")), None)
     if low is None or low.horizon is None:

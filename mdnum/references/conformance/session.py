@@ -103,7 +103,7 @@ class Session:
     def _call(
         self, case: Case, positions: ndarray, cell: ndarray, pbc: ndarray, skin: float | None
     ) -> CallOutcome:
-        """Call the neighbor list once; allocate an updatable list if `skin` is given, else update it."""
+        """Call the neighbor list once; allocate an updatable list if `skin` is given, otherwise update it."""
         inputs = {"positions": positions, "cell": cell, "pbc": pbc}
         before = {name: array.copy() for name, array in inputs.items()}
         returned, self._returned = self._returned, []
@@ -342,7 +342,7 @@ class _Ended(Exception):
 
 
 def _watch(process: Any, seconds: float, deadline: Deadline, done: threading.Event, late: list[str]) -> None:
-    """Kill a process that exceeds its time limit; append a phrase about its used time to the list `late`."""
+    """Kill a process that exceeds its time limit; append to `late` whether it computed or only waited."""
     began, used = time.monotonic(), _processor_seconds(process.pid)
     left = seconds
     while not done.wait(min(left, deadline.left)):
