@@ -374,7 +374,7 @@ class Impact(_Forceless):
 
     With `EventLocated`, the impact takes place at its exact time, and the flight continues for the rest of
     the step. With another scheme, a ball below the floor is put on the floor at the end of the step, and its
-    velocity is reset. This reset causes an error of order h in the state and of order 1 in the derivative.
+    velocity is reset. The reset causes an error of order h in the state and of order 1 in the derivative.
     """
 
     restitution: Any = 0.8  # speed after over speed before

@@ -173,7 +173,7 @@ class Window:
 
     @property
     def power(self) -> float:
-        """Smallest score/limit ratio among deliberate changes that must be detected; infinity without any."""
+        """Smallest score/limit ratio of deliberate changes that must be detected; infinity if none exist."""
         return min((score for one in self.table if one.must_fail for score in one.scores), default=np.inf)
 
     @property

@@ -44,7 +44,7 @@ _NUMBERS = (
 def nodes_of(simulation: Simulation, start: Start) -> Float[np.ndarray, "nodes"]:
     """Return the peak positions of the hat functions of the pair histogram, then the histogram's upper end.
 
-    The distances extend from the closest pairs of the initial state to the largest distance that is counted.
+    The distances extend from the closest pairs of the initial state to the largest distance in the histogram.
     """
     simulation = simulation.in_row(start.state.cells[0])
     half = float(np.min(simulation.cell.widths)) / 2

@@ -1,9 +1,9 @@
 """A run recorded for gradients: its time steps, in forward or reverse order, and sums for the loss.
 
 Recorded stretches of steps are kept in memory until the memory limit is reached. Stretches that do not fit
-into memory are computed again from the state at their first step. The repeated steps have the same bits,
-because program, state and neighbor list are the same. A run in fixed-point numbers need not be stored. The
-steps of such a run are reversed, and must lead back to exactly the initial state.
+into memory are computed again from the state at their first step. Repeated steps agree bit for bit with the
+first run, because program, state and neighbor list are the same. A run in fixed-point numbers need not be
+stored. The steps of such a run are reversed, and must lead back to exactly the initial state.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ _FINGERPRINTS = 256
 
 @dataclass(frozen=True)
 class TapeStretch:
-    """States and cutoff decisions of successive steps with one neighbor list, atoms in its order."""
+    """States and cutoff decisions of successive steps with one neighbor list, in the list's atom order."""
 
     # first, rows: its first step and the number of rows in use; those beyond are void
     first: int

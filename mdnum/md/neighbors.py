@@ -86,7 +86,7 @@ class PairTable:
     def decided(
         self, bits: UInt8[np.ndarray, "words atoms"]
     ) -> tuple[Int[np.ndarray, "pairs"], Int[np.ndarray, "pairs"]]:
-        """Return the atoms i < j of all pairs whose decision is true, each pair once, in table order.
+        """Return the atoms i < j of all pairs decided as inside, each pair once, in table order.
 
         For cutoff number c (counted from 0), c times the number of atoms is added to the atom index i.
         """

@@ -1,6 +1,6 @@
 """Thermostats that scale all velocities by one factor (Nosé-Hoover chains, stochastic rescaling).
 
-If the total momentum is zero, it stays zero, and the system has three degrees of freedom fewer
+If the total momentum is zero, it stays zero, and the system has three fewer degrees of freedom
 (`Integrator.freedom`). The variables of a thermostat are always float64. Velocities are scaled in float64,
 too. If a factor near one were rounded to float32, all atoms would have the same relative error.
 """

@@ -73,7 +73,7 @@ class Search:
         return self.listed.limits.refusal(once("", "few", positions, cell, pbc.tolist(), r_cut))
 
     def pairs(self, positions: ndarray, cell: ndarray, pbc: ndarray, r_cut: float) -> tuple[ndarray, ndarray]:
-        """Return arrays i and j of the pairs within r_cut, with one entry for each periodic image, i <= j."""
+        """Return atom indices i <= j of the pairs within r_cut, with one entry for each periodic image."""
         positions, cell = self._placed(np.asarray(positions, float), np.asarray(cell, float), pbc)
         answer = read(self._call(positions, cell, np.array(pbc), float(r_cut)))
         i, j = np.minimum(answer.i, answer.j), np.maximum(answer.i, answer.j)
@@ -387,7 +387,7 @@ def effective_cutoff(
 
 
 def borderline_pairs(r_cut: float, count: int) -> ndarray:
-    """Return randomly oriented pairs, shape (count, 2, 3), whose distances are within 3 ulps of r_cut."""
+    """Return positions of random pairs of atoms, shape (count, 2, 3), at distances within 3 ulps of r_cut."""
     rng = np.random.default_rng(0)
     direction = rng.normal(size=(count, 3))
     direction /= np.linalg.norm(direction, axis=1)[:, None]

@@ -1,6 +1,6 @@
 """Simultaneous simulation of two runs, and of each run with the cutoff decisions of the other run imposed.
 
-Without imposed decisions, each run gives the same bits as if it were made alone, because neighbor lists and
+Without imposed decisions, each run gives bit for bit the results of a single run, because neighbor lists and
 compiled loops are separate. The comparison of the two runs uses only changes of cutoff decisions. The cost of
 this comparison does not depend on the number of pairs; only pairs with different decisions are stored.
 """

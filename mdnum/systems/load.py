@@ -1,4 +1,4 @@
-"""Finding and loading system files: shipped systems by name, a user's files by path."""
+"""Find and load system files: shipped systems by name, a user's files by path."""
 
 from __future__ import annotations
 
@@ -146,7 +146,7 @@ class System:
 
     @property
     def draw(self) -> structures.Draw:
-        """Settings by which the velocities of step 0 are drawn."""
+        """Settings for drawing the random velocities of step 0."""
         dynamics, drawn = self.spec.dynamics, not self.atoms.has("momenta")
         return structures.Draw(float(dynamics.temperature), dynamics.seed, dynamics.remove_drift, drawn)
 
@@ -164,7 +164,7 @@ class System:
 
     @property
     def r_cut(self) -> float:
-        """Longest interaction radius, in length units."""
+        """Largest distance at which two atoms interact directly, in length units."""
         return pairs.longest_radius(self.spec, self.species, self.folder)
 
     @property

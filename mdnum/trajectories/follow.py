@@ -488,7 +488,7 @@ def _apart(
 ) -> tuple[Separation, float]:
     """Return each atom's distance between two files after removing a common shift, and an error bound.
 
-    A shift common to all atoms is removed only if it explains nearly all of these distances. Such a shift can
+    A shift common to all atoms is removed only if it explains nearly all of the distances. A common shift can
     result from different origins of two files, or from removal of center-of-mass motion in one file.
     """
     now = separation(a, b, atoms)

@@ -67,7 +67,7 @@ class Slope:
 
     @property
     def gap(self) -> float:
-        """Absolute difference between the finite difference and the force, eV/Å."""
+        """Absolute difference between the finite difference of the energy and the force, eV/Å."""
         return abs(self.difference - self.force)
 
     @property
@@ -342,7 +342,7 @@ def _row(one: Slope) -> dict[str, Any]:
 
 
 def _chart(slopes: list[Slope]) -> Chart:
-    """Chart of force error against finite-difference step: a valley if forces are correct, else a plateau."""
+    """Chart of force error versus finite-difference step: correct forces give a minimum, others a plateau."""
     shown = slopes[:_DIRECTIONS]
     shown += [one for one in [_worst(slopes)] if one not in shown]
     lines = {one.direction: one.gaps[::-1].tolist() for one in shown}

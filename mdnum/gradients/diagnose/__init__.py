@@ -164,7 +164,7 @@ def _asked(method: Method, problem: Problem, names: Sequence[str], progress: Pro
 def compare(
     name: str, one: Gradient, reference: Gradient, unit: float, growth: float, *, jumps: bool
 ) -> GradientDifference:
-    """Compare the derivatives of two gradients with respect to one parameter.
+    """Compare the derivatives with respect to one parameter that two methods computed.
 
     Args:
         unit: unit roundoff of the run's state or forces, whichever is coarser.

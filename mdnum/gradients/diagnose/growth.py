@@ -5,9 +5,9 @@ this state. One reverse pass over T steps therefore gives gradients for all hori
 belongs to a different start on the same trajectory. Cotangents of a chaotic run span many powers of two.
 Scaling the loss helps if all cotangents are small, but not if their range exceeds that of the narrow format.
 
-The largest singular value of a run's Jacobian bounds the gradient of any loss of the last state. Singular
-values are computed by subspace iteration with a random block of vectors (Halko, Martinsson and Tropp 2011).
-The block is orthonormalized after every stretch of steps, to prevent overflow and parallel vectors.
+The largest singular value of a run's Jacobian bounds the gradient of any loss that depends on the last state.
+Singular values are computed by subspace iteration with a random block of vectors (Halko, Martinsson and Tropp
+2011). The block is orthonormalized after every stretch of steps, to prevent overflow and parallel vectors.
 """
 
 from __future__ import annotations
@@ -83,7 +83,7 @@ class GrowthWatch:
         self._scalars = [name for name in self.names if not name.startswith("initial.")]
 
     def __call__(self, stretch: TapeStretch, trace: AdjointCarry) -> None:
-        """Collect data from the cotangents of one stretch of steps of a reverse pass."""
+        """Collect data from the cotangents of successive steps of a reverse pass."""
         rows, first = stretch.rows, stretch.first
         onto_x, onto_v = (np.asarray(part, np.float64)[:rows] for part in (trace.x, trace.v))
         v = stretch.v[:rows].astype(np.float64)
@@ -196,7 +196,7 @@ class ScalingWatch:
         self.exponents = np.zeros((steps + 1, _HIGHEST - _LOWEST + 1), np.int32)
 
     def __call__(self, stretch: TapeStretch, trace: AdjointCarry) -> None:
-        """Collect data from the cotangents of one stretch of steps of a reverse pass."""
+        """Collect data from the cotangents of successive steps of a reverse pass."""
         for row in range(stretch.rows):
             both = (np.asarray(part[row], np.float64).ravel() for part in (trace.x, trace.v))
             self.put(stretch.first + row, np.concatenate(list(both)))

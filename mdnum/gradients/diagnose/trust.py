@@ -530,7 +530,7 @@ def last_below(
 ) -> tuple[int, bool]:
     """Return the last horizon before two successive errors exceed a limit, and whether such errors exist.
 
-    A single value beyond the limit is ignored (except at the last horizon), because relative errors are large
+    A single error above the limit is ignored (except at the last horizon), because relative errors are large
     where a gradient changes sign.
     """
     beyond = ~(np.max(np.stack(list(values.values())), axis=0) <= limit)
