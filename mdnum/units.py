@@ -90,7 +90,7 @@ class Measured:
         return f"{self.value:.{min(max(math.ceil(-math.log10(self.floor)), 1), 15)}f}"
 
     def to(self, prefix: str, units: Mapping[str, Any] = MappingProxyType({})) -> Measured:
-        """Convert the number to a unit with a prefix ("m" for milli), with the names of a unit system."""
+        """Convert the number to a unit with a prefix ("m" for milli); `units` contains the names of units."""
         unit = named(self.unit, units) or self.unit
         size = {"": 1.0, "m": 1e3}[prefix]
         scaled = {name: size * part for name, part in vars(self).items() if isinstance(part, float)}

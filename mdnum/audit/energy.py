@@ -1,4 +1,4 @@
-"""Energy balance of a run: jumps of the energy at thresholds and elsewhere, work of the forces, drift.
+"""Energy balance of a run: energy jumps at thresholds and elsewhere, work of the forces, energy drift.
 
 If the force is minus the gradient of the energy, energy change plus work is zero along the straight line
 between two time steps, for every integrator. If an energy change at a distance threshold is not explained by
@@ -156,7 +156,7 @@ def along_step(subject: CalculatorSubject, run: NveRun, step: int, ends: bool = 
 def account(
     subject: CalculatorSubject, run: NveRun, step: int, crossed: Sequence[RunCrossing], smooth: int = 2
 ) -> tuple[list[float], float]:
-    """Compute the work of forces along a time step's straight line, in pieces between threshold crossings.
+    """Compute the work of the forces between two time steps, piece by piece between threshold crossings.
 
     Args:
         subject: a calculator object separate from the run's; called three times per crossing, plus once.
@@ -218,7 +218,7 @@ class HiddenJumps:
 
     @property
     def share(self) -> float:
-        """Fraction of the unexplained energy change that jumps explain, in the time steps searched."""
+        """Fraction of the otherwise unexplained energy change that is due to jumps, in the searched steps."""
         whole = sum(abs(rest) for rest in self.steps.values())
         left = sum(abs(rest - self.brought(step)) for step, rest in self.steps.items())
         return max(1.0 - left / whole, 0.0) if whole else 0.0
@@ -236,7 +236,7 @@ class HiddenJumps:
 
     @property
     def rank(self) -> tuple[int, int]:
-        """Rank k whose neighbors k and k+1 swap most often at energy jumps, and the number of these jumps."""
+        """Rank k for which neighbors k and k+1 swap most often at energy jumps; number of such jumps."""
         return _most_frequent(k for jump in self.jumps for k in {k for _, k in jump.ties})
 
     @property
@@ -320,7 +320,7 @@ class EnergyBalance:
 
     @property
     def filled(self) -> Steps:
-        """Unexplained energy change of each step minus its jumps, eV; the mean for steps not measured."""
+        """Unexplained energy change of each step without its jumps, eV; unmeasured steps have the mean."""
         left = self.rest - self.elsewhere
         return np.where(np.isnan(left), np.nanmean(left), left)
 
@@ -427,7 +427,7 @@ def wandering(time: Steps, increments: Steps) -> Drift:
     """Return the drift of a quantity that changes by uncorrelated increments, such as energy jumps.
 
     The deviation of a random walk from a fitted line is itself a random walk. The standard error is therefore
-    computed from sums over blocks and not from this deviation.
+    computed from sums over blocks, not from deviations from the line.
 
     Args:
         increments: at least 16, each of the interval that ends at its time.

@@ -1,11 +1,11 @@
-"""Search for discontinuities of the energy among many atoms, using moving atoms and dense clusters.
+"""Search for discontinuities of the energy of many atoms, with moving atoms and dense clusters.
 
 In a many-body potential, the interaction of a pair depends on other atoms. The energy may then jump at a
 threshold where it is smooth for two isolated atoms. Atoms and triples of atoms are therefore moved through
 all pair thresholds, and also through other distances. To detect a limit on the number of neighbors, one more
-atom is moved past all neighbors of a crowded central atom. If a calculator keeps only k neighbors, the moving
-atom replaces the k-th neighbor when both are equally far away. The energy or a force then jumps. If a
-calculator keeps the first k neighbors in the order of the list, reordering the atoms reveals the limit.
+atom is moved past all neighbors of a crowded central atom. If a calculator keeps only k neighbors, the energy
+or a force jumps where the moving atom and the k-th neighbor are equally far away. If a calculator keeps the
+first k neighbors in the order of the list, reordering the atoms reveals the limit.
 """
 
 from __future__ import annotations
@@ -210,7 +210,7 @@ def _lead(atoms: Atoms, group: np.ndarray) -> int:
 def _targeted(
     atoms: Atoms, thresholds: Sequence[PairThreshold], groups: Sequence[np.ndarray]
 ) -> list[tuple[Route, RouteCrossing]]:
-    """Return a few routes for each threshold; on each, a nearby pair of atoms crosses the threshold."""
+    """Return a few routes for each threshold; on each route, a nearby pair crosses the threshold."""
     of_lead = {_lead(atoms, group): group for group in groups}
     symbols = np.array(atoms.get_chemical_symbols())
     ranked: list[tuple[int, Route, RouteCrossing]] = []
@@ -237,7 +237,7 @@ def _targeted(
 
 
 def _at_crossing(subject: CalculatorSubject, route: Route, crossing: RouteCrossing) -> Event:
-    """Measure the jump at a known threshold; locate a jump of energy or force to two adjacent doubles."""
+    """Measure the jump at a known threshold; if energy or force jumps, locate the jump exactly."""
     curve, side = route.curve(subject), max(_SIDE, 3 * crossing.threshold.located)
     # what is smooth for two may jump among others: the lowest derivative that does, whatever the threshold
     for row in range(2):
@@ -381,9 +381,9 @@ def crowd(subject: CalculatorSubject, progress: Progress, ways: Ways, most: int 
 def cluster(pair: Pair, radius: float, count: int) -> tuple[Atoms, Float[np.ndarray, "neighbors"]]:
     """Return a central atom at the origin with `count` neighbors at different distances, and these distances.
 
-    The neighbors fill the shell evenly (golden spiral in angle, equal volumes in distance); random positions
-    would put some neighbors too close together. The central atom is the first atom, followed by the neighbors
-    in order of distance.
+    The neighbors are evenly spread in angle (golden spiral) and in volume. Random positions would put some
+    neighbors too close together. The central atom is the first atom, followed by the neighbors in order of
+    distance.
     """
     k = np.arange(count)
     share = (k + 0.5) / count
@@ -491,7 +491,7 @@ def _permuted(
 ) -> tuple[float, float] | None:
     """Return the changes of energy and force when atoms are reordered; None if rounding explains the changes.
 
-    If `aside`, the last neighbor is moved so far away that it interacts with no atom.
+    If `aside` is true, the last neighbor is moved so far away that it interacts with no atom.
     """
     atoms, _ = cluster(walk.pair, radius, count)
     if aside:

@@ -1,7 +1,7 @@
 """Locate the distance thresholds of a calculator's pair interactions, using only energies and forces.
 
 Two atoms are moved from a large distance to the distance at which their energy is 1000 kT. Thresholds that
-appear only among many atoms (cutoffs of angles, limits on neighbors) are found by surroundings.py.
+appear only among many atoms (cutoffs of angles, limits on numbers of neighbors) are found by surroundings.py.
 """
 
 from __future__ import annotations
@@ -284,7 +284,7 @@ def _of_others(pair: Pair, threshold: PairThreshold, thresholds: Sequence[PairTh
 def _end_of(
     coarse: Float[np.ndarray, "points"], alive: Callable[[float], bool]
 ) -> tuple[float, float] | None:
-    """Return the largest distance at which the atoms interact, and the next double; None if there is none.
+    """Return the largest distance with an interaction, and the next larger double; None if there is none.
 
     A smooth switching function may round to zero before its end. If the interaction is nonzero at a larger
     distance, the search therefore continues from there.
@@ -446,7 +446,7 @@ def _smooth(curve: Curve, low: float, high: float, noise: Float[np.ndarray, "2"]
 
 
 def _left(nodes: Float[np.ndarray, "nodes"], forces: Float[np.ndarray, "nodes"]) -> float:
-    """Return the energy change (maybe infinite) from the last point to infinity, for a power-law force."""
+    """Return the energy change from the last point to infinity for a power-law force; inf if it diverges."""
     first, last = abs(float(forces[0])), abs(float(forces[-1]))
     if not last or not first:
         return np.inf

@@ -28,7 +28,7 @@ _CHUNK = 2**21  # balls times steps that leave the device at once
 
 @result
 class BallRun:
-    """Record of a finished run. If an array has one row per step, row s is the step from state s to s + 1.
+    """Record of a finished run. In arrays with one row per step, row s is the step from state s to s + 1.
 
     Attributes:
         world: the bouncing-ball model that was simulated.
@@ -279,7 +279,7 @@ class CrossDecision(NamedTuple):
 
 @dataclass(frozen=True)
 class BallDifference:
-    """How two runs differ: first step with different bits, differing decisions, and heights."""
+    """Steps at which states and decisions of two runs first differ, and differences of the heights."""
 
     seed: int | None  # first step whose state bits differ (0: the start itself); None where none do
     fork: int | None  # first step whose decisions differ; None where none do
@@ -296,7 +296,7 @@ class BallDifference:
 
 
 def first_difference(a: BallRun, b: BallRun) -> BallDifference:
-    """Compare two runs, and find the first step with different bits and the first with different decisions.
+    """Compare two runs, and find the steps at which states and decisions first differ.
 
     Raises:
         InputError: the runs have different lengths or numbers of balls.
@@ -427,7 +427,7 @@ def _unequal_counts(a: BallRun, b: BallRun, rows: int) -> np.ndarray:
 
 
 def _counted(run: BallRun) -> str:
-    """Return what the iteration count of a run refers to, such as "impacts"."""
+    """Return the kind of iteration that a run counts, such as "impacts"."""
     contact, scheme = run.world.contact, run.world.integrator
     if isinstance(scheme, EventLocated):
         return "impacts"

@@ -173,7 +173,7 @@ def fork(
 def counterfactuals(
     twin: Twin, counterfactual: bool, back: bool | None, repeats: int | None
 ) -> tuple[bool, bool, int]:
-    """Return whether to impose run A's decisions on run B, whether B's on A, and how often to repeat run B.
+    """Return whether run B gets run A's decisions, whether A gets B's, and how often run B is repeated.
 
     Raises:
         InputError: a requested counterfactual run or repeat is not possible.
@@ -217,7 +217,7 @@ def _beyond(step: int) -> int:
 
 
 def displacements(fork: Fork) -> tuple[float, float]:
-    """Return two initial displacements for repeats of run B: the early distance to run A, and a smaller one.
+    """Return two initial displacements for repeats of run B: an early distance from run A, and a smaller one.
 
     The second displacement is a hundredth of the first. A repeat with a much smaller displacement would make
     the same rounding errors as the compared runs, and so would prove nothing. If a hundredth of the first

@@ -3,7 +3,7 @@
 Programs of one system (compiled, uncompiled, batched, differentiated, or for other processors) compute the
 same formulas, but may round differently. XLA flags apply to a whole process, so each variant of a program
 runs in its own process. Variants whose positions have equal hashes at every step are numerically the same
-program. If hashes differ, the cause follows from which variants agree.
+program. If hashes differ, the groups of variants with equal hashes indicate the cause.
 
 `python -m mdnum.forks.processes FILE` executes the task described in a JSON file, and writes a file with an
 array of positions.
@@ -227,9 +227,9 @@ def clustered(rows: Sequence[Ran]) -> list[Ran]:
 def causes_of(rows: Sequence[Ran]) -> Iterator[dict[str, Any]]:
     """Return codes for the causes of differences between variants; variants without a result are ignored.
 
-    The codes "fused", "others" and "not_fused" describe programs without fused operations, "eager_..." the
-    program without a compiler, and "reversed" reversed sums. Other codes describe the program that the entry
-    "program" names. If a variant differs from the reference, "step" is the first step at which they differ.
+    The codes "fused", "others" and "not_fused" concern fused operations. The codes "eager_..." concern the
+    program without a compiler, and "reversed" concerns reversed sums. Other codes concern the program named
+    by "program". If a variant differs from the reference, "step" is the first step at which they differ.
     """
     by_name = {row.variant.name: row for row in rows if not row.failed}
     reference = next(iter(by_name.values()))
@@ -371,7 +371,7 @@ def _question(system: Simulation | BallSystem, steps: int, folder: Path) -> dict
 
 
 def _ask(question: Mapping[str, Any], file: Path, settings: Mapping[str, str]) -> str:
-    """Run a process that executes a task; return why the process failed, or "" if it succeeded.
+    """Run a process that executes a task; return the reason for its failure, or "" if it succeeded.
 
     `settings` are environment variables of the new process.
     """

@@ -156,9 +156,9 @@ def onto_crossings(
     """Propagate cotangents backward through the crossings (saltation) of one step.
 
     On average, a crossing lies halfway through the drift between two steps. Let n be the unit vector from i
-    to j, f the force jump and s = n · (v_j - v_i) + n · (dh/dt h^-1) r the radial speed, including the motion
-    of the box. Let dr be the change of the distance at the crossing: n · (dx_j - dx_i), minus the change of
-    the lattice vectors between the images. The force jump then acts for a time that changes by dr/s:
+    to j, f the force jump, h the lattice vectors, and s = n · (v_j - v_i) + n · (dh/dt h^-1) r the radial
+    speed. A perturbation changes the distance by dr = n · (dx_j - dx_i - dL), where L is the lattice
+    translation between the images. The duration of the force jump then changes by dr/s:
 
         d(m v_j) = f n dr/s = -d(m v_i)    on the atoms, through the force
         d(W) = (f r_cut n ⊗ n) dr/s        on the integrator's use of the virial tensor W
@@ -207,10 +207,10 @@ def of_energy(
     onto: tuple[Float[Array, "3 atoms"], Float[Array, ""], Float[Array, ""]],
     squeeze: Float[Array, "*axes"] | None = None,
 ) -> Float[Array, "most"]:
-    """Compute cotangents of crossing distances for an energy function, with jumps E(with pair) - E(without).
+    """Compute cotangents of crossing distances from an energy function, evaluated with and without each pair.
 
     The jump affects all atoms whose energy depends on the pair. It is evaluated with the pair at its cutoff
-    distance. Other pairs that cross in the same step have their decisions at the end of the step.
+    distance. For other pairs that cross in the same step, the decisions at the end of the step are used.
 
     Args:
         met: crossings whose `push` is one over the radial speed, negative where the pair leaves.

@@ -90,7 +90,7 @@ def _binned(x, cell: Cell, low, span, bins: _Whole):
 def _searched(
     x, places, cell: Cell, start, r2_list, bins: _Whole, reach: _Whole, room: int, slots: int, blocks: int
 ):
-    """Return neighbors of sorted atoms, and their largest number; above `slots`, neighbors are missing."""
+    """Return the neighbors of each atom and their largest number; neighbors beyond `slots` are missing."""
     atoms = x.shape[1]
     matrix = cell.matrix
     # layer after layer along the third axis, as the host goes

@@ -1,4 +1,4 @@
-"""Integrators, which update the state between two force evaluations, and the function for a time step.
+"""Integrators, which update the state between two force evaluations, and the function that makes a time step.
 
 A step evaluates the forces at x_s and completes the previous step (`finish`), which gives full-step
 velocities v_s. The first half of the next step (`begin`) gives the positions x_{s+1}. The state between steps
@@ -337,7 +337,7 @@ class KickDrift(Integrator):
 
 
 def without_kick(integrator: Integrator) -> str | None:
-    """Return why derivatives of an integrator's kick and drift are invalid; None if they are valid."""
+    """Return the reason why derivatives of kick and drift are invalid; None if the derivatives are valid."""
     if type(integrator) in (VelocityVerlet, Langevin):
         return None
     if isinstance(integrator, KickDrift) and _is_linear(integrator):

@@ -331,7 +331,7 @@ class PairRecorder:
         return (margin >= 0 if inclusive else margin > 0) != ledger.entered
 
     def held(self) -> Int[np.ndarray, "pairs"] | None:
-        """Return integer keys of the pairs inside the cutoff at the last step of the previous list."""
+        """Return integer keys of pairs inside the cutoff at the last step of the previous neighbor list."""
         if self._held_segment is not None:
             table, bits, _ = self._held_segment
             self._held_keys = _keys(self.simulation, table, np.asarray(bits))

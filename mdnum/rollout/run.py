@@ -186,7 +186,7 @@ class Rollout:
             self.shown(here, np.asarray(positions, np.float64))
 
     def _needs_rows(self) -> bool:
-        """True if time steps are read so often that storing them is faster than repeating them."""
+        """True if time steps are read so often that storing them is faster than recomputing them."""
         simulation = self.simulation
         policy = simulation.policy
         # in single precision most steps have a margin within its bound, and a bad list misses pairs

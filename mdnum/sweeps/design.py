@@ -156,7 +156,7 @@ def points(
 
 
 def _filling(axes: Sequence[Axis], samples: int) -> list[dict[str, Any]]:
-    """Return settings from a scrambled Sobol sequence between the ends of each axis (varied choice)."""
+    """Return settings from a scrambled Sobol sequence, between the extreme values of each varied choice."""
     from scipy.stats import qmc
 
     if samples < 2 or samples & (samples - 1):

@@ -46,10 +46,10 @@ class SeedMean:
 def estimates(found: Mapping[K, Sequence[tuple[float, float, float]]]) -> dict[K, SeedMean]:
     """Return the mean of one measure at each setting, over runs that differ only in their random seed.
 
-    The error of a mean, estimated from its runs, is multiplied by the ratio of the observed scatter between
-    seeds to the scatter expected from such errors. One ratio is used for all settings of a measure; more
-    settings make the ratio more precise. The scatter between the seeds of a single setting is used instead if
-    it has more degrees of freedom.
+    The error of each mean is estimated from its runs, and then multiplied by a ratio: the observed scatter
+    between seeds, divided by the scatter expected from such errors. The ratio is the same for all settings of
+    a measure; more settings make it more precise. The scatter between the seeds of a single setting is used
+    instead if it has more degrees of freedom.
 
     Args:
         found: (value, standard error, independent samples) of each run; nan if unknown.

@@ -54,7 +54,7 @@ class Evaluation:
 
     @property
     def distance(self) -> Float[np.ndarray, "pairs"]:
-        """Distances of the pairs inside the cutoff, length."""
+        """Distances of the pairs inside the cutoff, in length units."""
         return self._pairs[2]
 
 
@@ -119,7 +119,7 @@ class Evaluator:
         return float(energy), found
 
     def _sorted(self, positions, cell) -> tuple[Simulation, np.ndarray, PairTable, Tables, jax.Array]:
-        """Prepare an evaluation: the simulation in a cell, its neighbor list, and positions in list order."""
+        """Return the simulation in a cell, its neighbor list, and positions in the order of the list."""
         check_not_forked()
         own = self.simulation
         same_box = cell is None or np.array_equal(cell, np.asarray(own.cell.matrix))

@@ -130,7 +130,7 @@ class Trial:
             self.model = replace(model, parameters=model.start(key, x, own))
 
     def bare(self, parameters, x, idx, real, cell, box, strain, code):
-        """Call the energy function in its own convention; return the energy in the function's unit."""
+        """Call the energy function in its calling convention; return the energy in the function's unit."""
         call, model = self.call, self.model
         neighbor = jaxmd.as_neighbor_list(idx, real, model.format, model.self_edges, code)
         if call.how.images:
@@ -172,7 +172,7 @@ class Trial:
         raise self.error("NOT_CALLABLE", error=failed, tried=", ".join(formats))
 
     def _returned(self) -> str:
-        """Return what the energy function returns: one of the values of `Convention.returns`."""
+        """Return the kind of result that the energy function returns: a value of `Convention.returns`."""
         shape = jax.tree.map(lambda one: one.shape, jax.eval_shape(self.bare, *self.arguments()))
         one = ((), (1,))
         if isinstance(shape, Mapping):
@@ -200,7 +200,7 @@ class Trial:
     # --- calling it -----------------------------------------------------------------------------------
 
     def there(self, x=None, idx=None, cell=None, code=0) -> tuple[float, Float[np.ndarray, "atoms 3"]]:
-        """Compute energy and forces in the simulation's units; `arguments` describes the arguments."""
+        """Compute energy and forces in the simulation's units; see `arguments` for the parameters."""
         how, call, cell = self.call.how, self.call, self.cell if cell is None else cell
         energy, (slope, *_) = self.slopes(*self.arguments(idx, x, cell, code))
         honest = how.fractional and not how.real_slope

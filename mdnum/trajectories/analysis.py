@@ -107,10 +107,10 @@ class NeighborFlips(AnalysisBase):
     `results.rules` is a `RuleResult`. Tables have a method `to_pandas()`. With by="residue", the pairs are
     pairs of residues. `i` and `j` are row numbers of `results.residues`, and `results.left_out` counts the
     excluded atoms. `results.resolution` is the resolution of positions in the file. `results.bound` contains
-    the resulting error bound of a distance in each frame. `results.repeats` lists the frames that repeat
-    earlier frames (see `repeats.RepeatedFrames`). `results.other_box` gives another possible box of the first
-    frame and a reason (see `Trajectory.other_box`), or None. `frames` and `times` list the numbers and times
-    of the frames analyzed; `FlipTable.frame` is an index into both.
+    the error bound of a distance in each frame. `results.repeats` lists the frames that repeat earlier frames
+    (see `repeats.RepeatedFrames`). `results.other_box` gives another possible box of the first frame and a
+    reason (see `Trajectory.other_box`), or None. `frames` and `times` list the numbers and times of the
+    frames analyzed; `FlipTable.frame` is an index into both.
 
     If a frame cannot be read or contains impossible values, an error with the frame number is raised. The
     results of all earlier frames are kept.

@@ -1,4 +1,4 @@
-"""Flips and contacts of each pair in a trajectory, and counts of the flips found with every nth frame.
+"""Flips and contacts of pairs in a trajectory, and counts of the flips found if every nth frame is read.
 
 From the flips found with every nth frame, the module `lost` estimates the flips missed between frames.
 """

@@ -233,7 +233,7 @@ def _fixed(values: Float[np.ndarray, "values"], slack: Float[np.ndarray, "values
 
 
 def _chance(parts: Float[np.ndarray, "values"]) -> float:
-    """Return the log probability that random values lie within these fractions of a spacing from a grid."""
+    """Return the log probability that random values lie as close to a grid as the distances `parts`."""
     return float(np.log(np.maximum(parts, 1e-300)).sum())
 
 

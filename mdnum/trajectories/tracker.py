@@ -198,7 +198,7 @@ class Tracker:
         return Moment(positions, lattice, rounding, np.zeros(len(self._who.radii), np.int64), none, none)
 
     def _decided(self, now: Moment) -> Moment:
-        """Find the neighbors at a frame, store the numbers of pairs, and return the frame with neighbors."""
+        """Find the neighbors at a frame, store the number of pairs, and return the frame and neighbors."""
         rule, bound, who = self.rule, self.bound + now.rounding, self._who
         if isinstance(rule, Nearest | Capped):
             reach = rule.reach if np.isfinite(rule.reach) else 0.0
@@ -238,7 +238,7 @@ class Tracker:
     # ---- two frames
 
     def _from_list(self, before: Moment, now: Moment) -> FlipTable | None:
-        """Return the flips found with the tiles (pairs of clusters); None if the tiles are unusable."""
+        """Return the flips found in the list of cluster pairs (tiles); None if the list is unusable."""
         who, bound, horizon = self._who, self.bound + now.rounding, HORIZON * self._who.radius
         clear = max(bound, horizon)
         if self._list is not None and not self._list.serve(before, now, who.radius, clear):

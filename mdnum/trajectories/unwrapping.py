@@ -1,9 +1,9 @@
 """Unwrapping of atomic paths across box boundaries, and detection of discontinuities between frames.
 
-Wrapping must move an atom by an integer combination of the lattice vectors at that frame. Otherwise,
+In each frame, wrapping must move atoms by integer combinations of the frame's lattice vectors. Otherwise,
 quantities computed from the path of the atom are wrong (von Bülow, Bullerjahn and Hummer, J. Chem. Phys. 153,
-021101, 2020). This module removes jumps by the lattice vectors of each frame, which preserves displacements
-(Bullerjahn, von Bülow, Heidari, Hénin and Hummer, J. Chem. Theory Comput. 19, 3406, 2023).
+021101, 2020). This module removes a jump by adding lattice vectors of the same frame, which preserves
+displacements (Bullerjahn, von Bülow, Heidari, Hénin and Hummer, J. Chem. Theory Comput. 19, 3406, 2023).
 """
 
 from __future__ import annotations
@@ -68,7 +68,7 @@ class Unwrapping:
         }  # fmt: skip
 
     def _pairs(self, here: np.ndarray, there: np.ndarray, cell: np.ndarray) -> dict[str, Any]:
-        """Return relative changes of nearly constant pair distances, across box boundaries and elsewhere."""
+        """Return relative changes of nearly constant distances: pairs across a box boundary, other pairs."""
         images = np.rint(there - here)
         split = images.any(axis=1) | (np.floor(here) != np.floor(there)).any(axis=1)
         lengths = np.linalg.norm((there - here - images) @ cell, axis=1)
@@ -109,7 +109,7 @@ def told(rows: Mapping[str, np.ndarray], atoms: int, timed: bool) -> dict[str, A
 
 
 def _seams(number: np.ndarray, step: np.ndarray, jumps: np.ndarray, atoms: int) -> list[dict[str, Any]]:
-    """Return frames with a sudden displacement of all atoms, or with more jumps than adjacent frames."""
+    """Return frames in which all atoms move suddenly, or more atoms jump than in adjacent frames."""
     found = []
     for k in range(len(step)):
         around = np.r_[max(k - _AROUND, 0) : k, k + 1 : min(k + _AROUND, len(step) - 1) + 1]

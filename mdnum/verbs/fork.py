@@ -1,6 +1,6 @@
-"""`mdnum fork`: the step at which two runs that differ in one numerical choice diverge, and why.
+"""`mdnum fork`: the step and the cause of the divergence of two runs that differ in one numerical choice.
 
-For molecular dynamics and for a ball, `fork` varies one numerical choice. `fork_screen` varies each choice in
+`fork` varies one numerical choice of an MD or bouncing-ball simulation. `fork_screen` varies each choice in
 turn. `fork_folders` compares or replays two finished runs. `fork_benign` compares ensembles of runs.
 """
 
@@ -181,7 +181,7 @@ def fork_screen(
 def fork_folders(
     a: str | Path, b: str | Path, *, replay: bool = False, objects: Sequence[Simulation] = (), **asked: Any
 ) -> Outcome:
-    """Compare two finished runs (molecular dynamics or a ball): their settings and the step of divergence.
+    """Compare the settings of two finished runs, and find the step at which the runs diverge.
 
     Example:
         >>> mdnum.fork_folders("runs/liquid-864", "runs/liquid-864-2")
@@ -326,7 +326,7 @@ def page_screen(view: View, verdict: Verdict) -> Page:
 
 
 def _ranking(rows: Any, steps: int, figure: Canvas) -> None:
-    """For each numerical choice, draw the steps where bits and decisions first differ and the runs split."""
+    """Draw, for each numerical choice, when states and decisions first differ and when the runs split."""
     axes = figure.subplots()
     place = np.arange(len(rows))[::-1]
     for name, label, marker, color, filled in (

@@ -1,4 +1,4 @@
-"""`mdnum fork certify` (comparison with exact arithmetic) and `mdnum fork processes` (program variants)."""
+"""The commands `mdnum fork certify` and `mdnum fork processes`: exact arithmetic and program variants."""
 
 from __future__ import annotations
 
@@ -120,7 +120,7 @@ def _lines(name: str, lines: Mapping[str, np.ndarray], first: int = 0) -> dict[s
 
 
 def _ambiguous(simulation: Any, answer: Answer) -> dict[str, Any]:
-    """For each precision, count decisions with margins below rounding bounds; evaluate them exactly."""
+    """For each precision, count and exactly evaluate the decisions with margins below rounding bounds."""
     from mdnum.forks.certified import certified_horizon
     from mdnum.numerics import PrecisionPolicy
 
@@ -154,7 +154,7 @@ def judge_certify(view: View) -> Verdict:
 
 
 def _gains(s: Mapping[str, Any], roles: Sequence[str]) -> Iterator[str]:
-    """Yield sentences on how one role's precision changes the number of steps with exact decisions."""
+    """Yield sentences on how the precision of a quantity changes the number of steps with exact decisions."""
     rows = s["policies"]
     by_dtype = {kind: next((row for row in rows if all(row[role] == kind for role in roles)), None)
                 for kind in ("float32", "float64")}  # fmt: skip

@@ -222,7 +222,7 @@ def _atoms(view: View, figure: Canvas) -> None:
 
 
 def _two_by_two(view: View) -> Iterator[Any]:
-    """Yield a table of the steps at which runs diverge, given arithmetic and decisions of run A or B."""
+    """Yield a table of the steps at which runs with the arithmetic and decisions of run A or B diverge."""
     s, unit = view.summary, view.units.length
     lines: dict[tuple[str, str], dict[str, str]] = {}
     for cell in s["table"]:
@@ -356,7 +356,7 @@ def _growth(view: View) -> Iterator[Any]:
 
 
 def _after(view: View) -> Iterator[Plot]:
-    """Yield figures of the number of different and overridden decisions, and of energies minus those of A."""
+    """Yield figures of numbers of different and overridden decisions, and of energy differences from A."""
     s, table = view.summary, view.table("separation")
     step, dates, length = table["step"], _dates(s, "fork", "split"), view.units.length
     named = [("cross", "decisions that differ"), ("overridden", "decisions overridden")]

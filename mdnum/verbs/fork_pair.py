@@ -56,7 +56,7 @@ class PairQuestion:
 
 
 def last_step(system: Any, steps: int | None, most: int | None = None) -> int:
-    """Return the last step of a run: `steps` or, by default, that of the system file (at most `most`).
+    """Return the last step of a run: `steps`, or by default the system file's last step, at most `most`.
 
     Raises:
         InputError: steps is below 1.
@@ -159,7 +159,7 @@ def followed(
 
 
 def _numbers(made: Fork) -> dict[str, Any]:
-    """Return summary entries on two runs: when they diverge, the verdict, growth of their distance."""
+    """Return summary entries on two runs: steps of divergence, verdict, and growth of their distance."""
     step, verdict, growth = made.twin.a.timestep, made.verdict, made.growth["B"]
     dates = {"first_bit": made.dates.first_bit, "fork": made.dates.fork, "split": made.dates.split}
     free, imposed, overridden = (
@@ -204,7 +204,7 @@ def _numbers(made: Fork) -> dict[str, Any]:
 
 
 def _boxes(made: Fork, dates: Mapping[str, int | None]) -> dict[str, Any]:
-    """Return the strain between simulation boxes of runs A and B: its maximum, and at end and divergence."""
+    """Return the strain between the boxes of runs A and B: its maximum, and values at end and divergence."""
     if "strain" not in made.series:
         return {}
     strain, free = made.series["strain"], made.series["B"]
@@ -217,7 +217,7 @@ def _boxes(made: Fork, dates: Mapping[str, int | None]) -> dict[str, Any]:
 
 
 def _fit(fit: Any, separation: np.ndarray) -> dict[str, Any]:
-    """Return the fit exp(intercept + rate * step) to the distance of two runs, and the steps of the fit."""
+    """Return the fit exp(intercept + rate * step) to the distance between two runs, and the fitted steps."""
     if not np.isfinite(fit.rate):
         return dict.fromkeys(("rate", "r_squared", "first", "last", "intercept"))
     step = np.arange(fit.first, fit.last + 1)

@@ -45,7 +45,7 @@ class SmoothnessCheck(AuditCheck):
     neighbors, routes = 160, 2
 
     def ask(self, subject: CalculatorSubject, progress: Progress) -> CheckResult:
-        """Move pairs and triples of atoms through distance thresholds, and give atoms many neighbors."""
+        """Move pairs and triples of atoms through distance thresholds, and test atoms with many neighbors."""
         walks = walk_pairs(subject, progress)
         if not walks.walks and subject.meter.deadline.passed:
             raise TimeUp
@@ -87,7 +87,7 @@ _energy, _length = partial(Measured, unit="energy"), partial(Measured, unit="len
 
 
 def place(threshold: PairThreshold) -> Measured:
-    """Return the distance at which a threshold lies, with its uncertainty, as text."""
+    """Return a distance threshold with its uncertainty and its unit."""
     return _length(threshold.radius, floor=threshold.located)
 
 
@@ -186,7 +186,7 @@ def _jumps(walks: PairWalks, around: EnvironmentWalks, kT: float) -> Iterator[Ob
 
 
 def _at_cutoff(around: EnvironmentWalks, kT: float) -> Iterator[Observed]:
-    """Yield a finding if the energy of many atoms is less smooth at a threshold than that of two."""
+    """Yield a finding if the energy of many atoms is less smooth at a threshold than the energy of two."""
     if not around.lower:
         return
     worst = min(
@@ -243,7 +243,7 @@ def _among_many(around: EnvironmentWalks, kT: float, not_walked: Sequence[str]) 
 
 
 def _caps(one: Crowd, kT: float) -> Iterator[Observed]:
-    """Yield findings about atoms with many neighbors, such as a maximum number of neighbors."""
+    """Yield findings about atoms with many neighbors, such as a limit on the number of neighbors."""
     values: dict[str, Any] = {"species": one.species, "radius": one.radius}
     if one.kept:
         values |= {"kept": one.kept, "distance": one.distance, "force": one.force}

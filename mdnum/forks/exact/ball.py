@@ -139,7 +139,7 @@ class _ExactBall:
         return _plus(ys, h, vs), _plus(vs, self.half, a)
 
     def step(self, index: int):
-        """Make a time step; return heights, velocities, heights used in decisions, contacts, iterations."""
+        """Make a time step; return heights, velocities, tested heights, contacts and iteration counts."""
         free, counts = self._free(index), [0] * len(self.y)
         if isinstance(self.contact_model, Penalty):
             heights = self._push(free)

@@ -77,12 +77,12 @@ class Turns:
 
     @property
     def gap(self) -> Float[np.ndarray, "turns"]:
-        """Difference of r and r_cut in a run with shorter steps; negative if the pair crossed the cutoff."""
+        """Distance from r to r_cut in a run with shorter time steps; negative if the pair crossed r_cut."""
         return self.table["gap"] + self.table["side"] * self.table["finer"]
 
     @property
     def reach(self) -> Float[np.ndarray, "turns"]:
-        """Uncertainty of the pair distance at turning points, from its changes in other runs."""
+        """Uncertainty of the pair distance at turning points, from runs with other time steps or rounding."""
         if not len(self):
             return np.zeros(0)
         shift = self.table["shift"]

@@ -1,4 +1,4 @@
-"""Test cases for neighbor lists: past failures by name, dense clusters, lattices, and random test cases.
+"""Test cases for neighbor lists: named past failures, dense clusters, lattices, and random test cases.
 
 For the tests of a library: `@given(cases())` draws test cases with all kinds of boxes and positions. Cutoffs
 of the test cases are at and between neighbor shells. `boxes()` draws only (cell, pbc, description).
@@ -122,7 +122,7 @@ def _outside() -> Named:
 def _across_walls() -> ndarray:
     """Return pairs of atoms along x, just less than r_cut apart; one atom is just below a multiple of r_cut.
 
-    If rounding to float32 assigns an atom to the next cell, its partner is two cells away.
+    If rounding to float32 assigns an atom to the next grid cell, its partner is two grid cells away.
     """
     hairs = (1e-6, 5.5e-8, 1e-9, 3e-12, 2e-16)
     pairs = []
@@ -163,7 +163,7 @@ def _crowds() -> Named:
 
 
 def vast() -> Iterator[Case]:
-    """Yield few atoms in a volume so large that a cell grid needs too much memory or 64-bit indices.
+    """Yield test cases with a volume so large that a cell grid needs too much memory or 64-bit indices.
 
     Very large volumes are tested in a separate process, because a process that allocates a huge cell grid may
     be killed.
@@ -299,7 +299,7 @@ def cases(draw: Any, most: int = 40) -> Case:
 
 
 def _images(cell: ndarray, pbc: Pbc, r_cut: float) -> int:
-    """Return how many lattice vectors must be searched for pairs of atoms inside the cutoff."""
+    """Return the number of periodic images that must be searched for pairs of atoms inside the cutoff."""
     if not any(pbc):
         return 1
     width = widths(completed(cell, np.array(pbc)))
@@ -398,7 +398,7 @@ def lattices() -> Iterator[Case]:
 
 
 def as_kept(tested: PairList, asked: Iterable[Case]) -> Iterator[Case]:
-    """Yield the given test cases, each with a skin of 0.3 cutoffs if the neighbor list is updatable."""
+    """Yield the given test cases, with a skin of 0.3 times the cutoff if the neighbor list is updatable."""
     for case in asked:
         yield replace(case, skin=0.3 * case.r_cut) if tested.kept else case
 
