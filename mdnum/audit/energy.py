@@ -128,7 +128,7 @@ def _furthest(moved: Float[np.ndarray, "atoms 3"]) -> float:
 
 
 def _root(start: Float[np.ndarray, "3"], way: Float[np.ndarray, "3"], square: float) -> float:
-    """Return the fraction s in [0, 1] at which the vector start + s way has the squared length `square`."""
+    """Return the fraction s in [0, 1] at which the vector start + s * way has the squared length `square`."""
     a, b, c = float(way @ way), 2 * float(start @ way), float(start @ start) - square
     inside = b * b - 4 * a * c
     if a == 0 or inside < 0:
@@ -140,7 +140,7 @@ def _root(start: Float[np.ndarray, "3"], way: Float[np.ndarray, "3"], square: fl
 
 
 def along_step(subject: CalculatorSubject, run: NveRun, step: int, ends: bool = False) -> Curve:
-    """Energy and force on the line between two time steps; if `ends`, reuse the run's values at both ends."""
+    """Energy and force on the line between two steps; if `ends` is true, both ends have the run's values."""
     way = run.positions[step] - run.positions[step - 1]
 
     def at_share(share: float) -> tuple[float, float]:

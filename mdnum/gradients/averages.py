@@ -2,7 +2,7 @@
 
 The derivative of an average with respect to a parameter has up to three contributions. First, at fixed
 positions, the value of the observable in each frame changes. Second, if the observable jumps when a pair
-enters the cutoff, the average changes with the cutoff radius. The contribution of this jump is its height
+enters the cutoff, the average changes with the cutoff radius. This contribution is the height of the jump
 times the density of pairs at the cutoff. Derivatives at fixed decisions omit this contribution. Third, with a
 thermostat, the statistical weight exp(-U/kT) of each frame changes.
 """

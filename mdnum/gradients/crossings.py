@@ -1,7 +1,7 @@
 """Contributions to a gradient from changes of the times at which pairs cross their cutoff (saltation).
 
-A perturbed pair crosses the cutoff earlier or later. If the force jumps at the cutoff, the perturbation then
-changes the pair's momentum after the crossing. The derivative at fixed decisions does not include changes of
+A perturbed pair crosses the cutoff earlier or later. If the force jumps at the cutoff, the change of the
+crossing time also changes the pair's momentum. The derivative at fixed decisions does not include changes of
 crossing times, however short the time steps are. A saltation matrix (mdnum.numerics) at each crossing adds
 the effect of the crossing time. The potential energy and the virial also jump at a crossing. If a loss sums
 energies or virials over equally spaced frames, a later crossing shifts the jump by a fraction of a frame.
@@ -70,7 +70,7 @@ class MetRows(NamedTuple):
 
 @dataclass(frozen=True)
 class Crossings:
-    """Cutoff crossings in one stretch of steps, with their normals, radial speeds and force jumps."""
+    """Cutoff crossings in one stretch of time steps, with normals, radial speeds and force jumps."""
 
     ledger: FlipTable  # the flips
     row: Int[np.ndarray, "crossings"]  # row of each in its stretch, ascending
@@ -209,8 +209,8 @@ def of_energy(
 ) -> Float[Array, "most"]:
     """Compute cotangents of crossing distances from an energy function, evaluated with and without each pair.
 
-    The jump affects all atoms whose energy depends on the pair. It is evaluated with the pair at its cutoff
-    distance. For other pairs that cross in the same step, the decisions at the end of the step are used.
+    The jump affects all atoms whose energy depends on the pair. The jump is evaluated at the cutoff distance.
+    For other pairs that cross in the same step, the decisions at the end of the step are used.
 
     Args:
         met: crossings whose `push` is one over the radial speed, negative where the pair leaves.

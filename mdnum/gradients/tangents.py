@@ -117,7 +117,7 @@ def tangents(
 
 
 def by_column(tape: RunTape, total: Any) -> Float[np.ndarray, "columns"]:
-    """Compute the derivatives of the loss from the tangents of its sums over frames."""
+    """Compute the derivatives of the loss from the tangents of the frame sums in the loss."""
 
     def one(tangent):
         return jax.jvp(lambda total: tape.loss.value(total, tape.frames), (tape.total,), (tangent,))[1]

@@ -371,7 +371,7 @@ def _charts(walks: PairWalks, subject: CalculatorSubject) -> list[Chart]:
 
 
 def _energies(walk: PairWalk, kT: float) -> Chart:
-    """Chart of the pair energy, in an energy range in which the jumps at thresholds are visible."""
+    """Chart of the pair energy; the energy range is chosen to make the jumps at thresholds visible."""
     depth = max(-float(walk.energy.min()), 2 * kT)
     shown = walk.energy < 2 * depth
     first = len(shown) - int(np.argmin(shown[::-1])) if not shown.all() else 0
