@@ -405,7 +405,7 @@ def _pieces(curve: Curve, middle: float, reach: float, width: float, degree: int
 def _third(curve: Curve, left: float, right: float, room: float, noise: float) -> list[Jump]:
     """Locate a jump of the energy's third derivative, using the force's second derivative on both sides.
 
-    Several widths of the fit are tried; the width whose halving changes the result least is used.
+    Of several fit widths, the one is used for which half the width gives the most similar result.
     """
     reach = 0.5 * (right - left)
     widths = [room / part for part in (6, 12, 24, 48) if room / part > 4 * reach]

@@ -307,7 +307,7 @@ class PredictedFlip:
 
 
 class ForecastRange(NamedTuple):
-    """The last step at which a forecast for one perturbation amplitude is valid, and the reason for it."""
+    """The last step of a valid forecast for one perturbation amplitude, and why the forecast ends there."""
 
     step: int  # the last one; -1 for none
     # why there: "end" of the run; "flip", the first one kicks its atoms; "close", whether a decision of the

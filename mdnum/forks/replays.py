@@ -299,7 +299,7 @@ class _Search:
                 self._positions[segment.first + row] = HostCell(segment.cell_of(row)), x
 
     def holds(self, keys: Sequence[int]) -> bool:
-        """Return whether B stays near A if these decisions are A's; False if no repeated runs are left."""
+        """Repeat B with A's decisions on atom pairs; test if B stays near A (False if no run is left)."""
         name = frozenset(keys)
         if name not in self.known:
             if self.spent():
