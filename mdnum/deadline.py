@@ -26,7 +26,7 @@ class TimeUp(Exception):
 class Deadline:
     """A deadline, after which a command does not start further work.
 
-    The amount of evidence for a verdict is counted in function calls, because time depends on the machine. A
+    The evidence for a verdict is measured in function calls, because time depends on the machine. A
     deadline can only reduce the number of function calls; the command then reports the reduced number.
 
     Args:

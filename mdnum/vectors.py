@@ -101,7 +101,7 @@ class _Vectors:
 
 @intrinsic
 def moved(typingctx: Any, source: Any, place: Any, shift: Any, out: Any, at: Any) -> Any:
-    """Copy eight numbers of an array, and add a shift to each number."""
+    """Copy eight numbers of an array, and add a shift to each copy."""
 
     def generate(context: Any, builder: Any, signature: Any, args: Any) -> Any:
         to = _Vectors(context, builder, source.dtype, EIGHT)

@@ -219,7 +219,7 @@ class MTK(Barostat):
         return extra._replace(rate=extra.rate + time * share * push / self.inertia(at.masses))
 
     def _kicked(self, v, extra, at, time):
-        """Return velocities after forces and strain-rate friction have acted for a given time."""
+        """Return velocities after the forces and the strain rate have acted for a given time."""
         rate = extra.rate
         slow = -time * (rate + trace(rate) / self.freedom(at.masses) * unit(rate))
         kick = acted(at.acceleration, time * growth(slow), fused=True)

@@ -78,7 +78,7 @@ class Call:
     name: str = "energy function"
 
     def bare(self, parameters: Any, x: Array, neighbor: Any, given: Mapping[str, Array]) -> Any:
-        """Return the energy in the function's own units; if `returns` is empty, return the function's result.
+        """Return the energy in the function's own units, or its unchanged result if `returns` is empty.
 
         Args:
             given: the keywords of the convention; for mdnum's own convention, "cell".
@@ -140,7 +140,7 @@ def _real_slope_jvp(primals, tangents):
 
 
 class EnergyFunction(ManyBody):
-    """Potential defined by an energy function over a jax-md neighbor list, with parameters in any pytree.
+    """Potential from an energy function over a jax-md neighbor list; its parameters can be any pytree.
 
     Attributes:
         parameters: a pytree of arrays; the name of each parameter is its path, `potential.parameters...`.

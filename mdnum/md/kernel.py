@@ -242,7 +242,7 @@ def _written(
     """Return the source of an LLVM function `word` that processes eight neighbor slots of a block of atoms.
 
     The arguments of `word` are the number of atoms, the constants, the stride between slots (in atoms), and
-    an address for each data row. The data rows are columns of the atoms, flags, sums, totals, decisions,
+    an address for each array. The arrays are the columns of the atoms, the flags, sums, totals, decisions,
     types and neighbors of the first slot, the smallest |margin| so far, and the table of atom data.
     """
     number, truth = jax.ShapeDtypeStruct((), np.float64), jax.ShapeDtypeStruct((), np.bool_)
@@ -521,7 +521,7 @@ def _of_width(text: str, wide: int) -> str:
 
 
 def _listed(rows: int, margins: bool) -> list[str]:
-    """Write code that tests whether atoms have neighbors in eight slots, and clears their decisions."""
+    """Write code that tests whether eight neighbor slots are in use, and clears the slots' decisions."""
     lines = []
     for k in range(8):
         lines += [

@@ -65,7 +65,7 @@ def looks(pairs: int, error: float = ERROR) -> tuple[tuple[int, int], ...]:
     """Return, for each stage of the sign test, the number of pairs of runs and how many of them must agree.
 
     The allowed error probability is used up in proportion to the number of pairs of runs (Lan and DeMets,
-    Biometrika 70, 659, 1983). For fair coin tosses, the probability of a given result by some stage is at
+    Biometrika 70, 659, 1983). For fair coin tosses, the probability of a result up to a given stage is at
     most the error probability times the fraction of pairs of runs used until then.
 
     Args:

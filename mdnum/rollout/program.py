@@ -219,7 +219,7 @@ class MdProgram:
         return Differing(nearest)
 
     def _pairs_at(self, steps: int, step: int) -> tuple[Int[np.ndarray, "inside"], Simulation, np.ndarray]:
-        """Return, for one step, the pairs inside the cutoff, the simulation in its box, and positions."""
+        """Return pairs inside the cutoff at one step, the simulation with this step's box, and positions."""
         for segment in Engine(self.simulation, steps, start=self.begin).segments():
             if segment.last >= step:
                 row = step - segment.first
@@ -228,7 +228,7 @@ class MdProgram:
         raise IndexError(f"the run has no step {step}")
 
     def state_at(self, step: int, last: int) -> tuple[Simulation, Float[np.ndarray, "atoms 3"]] | None:
-        """Return, for one step, the simulation in its box and wrapped positions; None after the run's end."""
+        """Return a simulation with one step's box, and wrapped positions; None if the run ended earlier."""
         track = Track(self.simulation, last, self.begin, self.frame, flips=False)
         while track.segment() is not None:
             rows = track.until(track.ready)

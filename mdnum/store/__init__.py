@@ -1,4 +1,4 @@
-"""Storage of a run in a folder: tables, frames, JSON and text files, which survive if the run is killed."""
+"""Storage of a run in a folder: tables, frames, JSON and text files, readable even if the run is killed."""
 
 from __future__ import annotations
 

@@ -148,7 +148,7 @@ class TableStream:
             self.flush()
 
     def look_up(self, of: str, columns: Mapping[str, Any]) -> None:
-        """Declare columns whose values are looked up, by an index in each row, when rows are written.
+        """Declare columns whose values are looked up from an index when rows are written.
 
         Args:
             of: name of the column of indices.

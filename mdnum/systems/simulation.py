@@ -308,7 +308,7 @@ class Simulation:
 
     @property
     def _guard(self) -> float:
-        """Length allowed for rounding errors when displacements are compared with the skin."""
+        """Tolerance (a length) for rounding errors when displacements are compared with the skin."""
         coarsest = max(unit_roundoff(self.policy.dtype(role)) for role in ("state", "decision"))
         return 16 * coarsest * float(np.linalg.norm(self.decider.reach.coordinate))
 

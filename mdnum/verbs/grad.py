@@ -368,7 +368,7 @@ def _ball_methods(asked: Sequence[str] | None) -> list[str]:
 def _ball_system(
     system: Any, of: str | None, names: Sequence[str], steps: int | None, overrides: Mapping[str, Any] | None
 ) -> BallSystem:
-    """Return a ball system whose tables contain the requested loss, parameters and number of steps."""
+    """Return a bouncing-ball system with the requested loss, parameters and number of steps."""
     from mdnum.systems import BallSystem, ball, load
 
     kinds = get_args(ball.LossTable.model_fields["kind"].annotation)
