@@ -1,12 +1,12 @@
 """`mdnum doctor`: tests of whether this installation computes correct numbers.
 
-All tests of `mdnum doctor` are computations on the current machine. Package versions that are known to be
-faulty are also reported, but no version is assumed correct.
+All tests of `mdnum doctor` are computations on the current machine. Package versions with known faults are
+also reported. No version is assumed correct.
 
-Error bounds in mdnum require that +, -, *, / and sqrt are correctly rounded and that sums are not reordered.
-On CPUs, XLA rounds correctly and does not reorder sums, but contracts a*b+c and rewrites divisions by
-constants. Contractions and rewritten divisions change the last bits of results. Two builds of a program may
-therefore decide differently on a pair whose distance differs from the cutoff by less than the error bound.
+Error bounds in mdnum assume that +, -, *, / and sqrt are correctly rounded. They also assume that sums are
+not reordered. On CPUs, XLA rounds correctly and does not reorder sums. It contracts a*b+c and rewrites
+divisions by constants. Contractions and rewritten divisions change the last bits of results. Two builds of a
+program may therefore decide differently on a pair at the cutoff, within the error bound.
 """
 
 from __future__ import annotations
@@ -97,7 +97,7 @@ def diagnose(budget: float = 18.0) -> Diagnosis:
 
 
 def _row(test: str, status: Status | bool, **values: Any) -> DoctorRow:
-    """Return a test result with its text; the status may be True for "ok" and False for "unsafe"."""
+    """Return a test result with its text. True stands for "ok", False for "unsafe"."""
     if not isinstance(status, str):
         status = "ok" if status else "unsafe"
     words = _WORDS[test]
@@ -186,7 +186,7 @@ def _differing(a: Any, b: Any) -> int:
 
 
 def float64() -> DoctorRow:
-    """Test that jax uses float64, and that device transfer and jit do not change float64 numbers."""
+    """Test that jax uses float64, and keeps float64 numbers unchanged."""
     values = np.array([np.float64(1) / 3, np.pi, 1 + 2**-52, 8.5125, 1e300, -(2.0**-1000)])
     after = np.asarray(jax.jit(lambda x: x)(jnp.asarray(values)))
     kept = after.dtype == np.float64 and after.tobytes() == values.tobytes()
@@ -198,10 +198,10 @@ def float64() -> DoctorRow:
 
 
 def elementwise() -> DoctorRow:
-    """Compare basic operations of jax (jitted and eager) with numpy, bit for bit, in float64 and float32.
+    """Compare basic operations of jax with numpy, bit for bit, in float64 and float32.
 
-    On an accelerator, quotients and square roots in float32 may be approximate; cutoff decisions do not use
-    these operations (`numerics.exact.root`).
+    On accelerators, float32 quotients and square roots may be approximate. Cutoff decisions do not use them
+    (`numerics.exact.root`).
     """
     # by name, which numpy and jax share, with the number of arguments
     operations = {
@@ -222,7 +222,7 @@ def elementwise() -> DoctorRow:
 
 
 def functions() -> DoctorRow:
-    """Measure differences between jax and numpy for exp, log, cos and power, in units in the last place."""
+    """Measure differences between jax and numpy for exp, log, cos and power, in ulp."""
     a, b = _numbers(3), _numbers(4) / 10
     ulps = {}
     for name, given in {"exp": [-a], "log": [a], "cos": [a], "power": [a, b]}.items():
@@ -236,7 +236,7 @@ def functions() -> DoctorRow:
 
 
 def reassociation() -> DoctorRow:
-    """Test that sums are not reordered: that (x + c) - c is not simplified and error-free sums are exact."""
+    """Test that jax does not reorder sums."""
     x, c = _numbers(5) * 1e-3, np.full(_COUNT, 1e3)
 
     def two_sum(a: Any, b: Any) -> tuple[Any, Any]:
@@ -255,14 +255,14 @@ def reassociation() -> DoctorRow:
 
 
 def contraction() -> DoctorRow:
-    """Test whether jit contracts a*b + c to a fused multiply-add with a single rounding."""
+    """Test whether jit contracts a*b + c to a fused multiply-add."""
     a, b, c = _numbers(6), _numbers(7), -_numbers(8)
     count = _differing(jax.jit(lambda a, b, c: a * b + c)(*map(jnp.asarray, (a, b, c))), a * b + c)
     return _row("contraction", "info" if count else "ok", count=count, of=_COUNT)
 
 
 def constant_division() -> DoctorRow:
-    """Test whether jit replaces x / c by x * (1 / c), and (x*c)*d by x*(c*d), for constants c and d."""
+    """Test whether jit replaces x / c by x * (1 / c), and (x*c)*d by x*(c*d)."""
     x = _numbers(9)
     divided = _differing(jax.jit(lambda x: x / 3.0)(jnp.asarray(x)), x / 3.0)
     folded = _differing(jax.jit(lambda x: (x * 0.1) * 0.7)(jnp.asarray(x)), (x * 0.1) * 0.7)
@@ -271,11 +271,11 @@ def constant_division() -> DoctorRow:
 
 
 def subnormals() -> DoctorRow:
-    """Test whether numpy and jax keep numbers below 2.2e-308, or flush them to zero.
+    """Test whether numpy and jax keep numbers below 2.2e-308, or set them to zero.
 
-    XLA flushes subnormal numbers to zero on CPUs, and a loaded library can make the processor flush all
-    subnormal numbers. Subnormal numbers are also tested in arrays that XLA splits among its own threads.
-    Results are compared as integers, since a comparison of floats can treat subnormal numbers as zero.
+    XLA sets subnormal numbers to zero on CPUs. A loaded library can make the processor do this in
+    all operations. Arrays that XLA splits among its own threads are tested, too. Results are compared as
+    integers, since a comparison of floats may treat subnormal numbers as zero.
     """
 
     def power(exponent: int, count: int) -> np.ndarray:
@@ -301,12 +301,12 @@ def subnormals() -> DoctorRow:
 
 
 def _fcc(cells: int) -> np.ndarray:
-    """Return the positions of an fcc crystal in units of its lattice constant, shape (4 cells³, 3)."""
+    """Return the positions of an fcc crystal, shape (4 cells³, 3). The lattice constant is 1."""
     return np.array([place for place in np.ndindex((2 * cells,) * 3) if sum(place) % 2 == 0]) / 2
 
 
 def tilted_crystal() -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return a perturbed fcc crystal of 500 argon atoms in a tilted box, with a padded list of pairs.
+    """Return a perturbed fcc crystal of 500 argon atoms in a tilted box, and its pairs.
 
     Returns:
         cell: columns are box vectors (3, 3), Å.
@@ -326,7 +326,7 @@ def tilted_crystal() -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 
 
 def squared_distances(cell: jax.Array, fractional: jax.Array, slots: jax.Array) -> jax.Array:
-    """Compute r² of listed pairs of atoms by one matrix-vector product, as in jax-md; 0 for padding."""
+    """Compute r² of listed pairs by one matrix-vector product, as in jax-md. Padding gives 0."""
     used = slots[:, 0] < fractional.shape[0]
     index = jnp.where(used[:, None], slots, 0)
     separation = fractional[index[:, 0]] - fractional[index[:, 1]]
@@ -336,7 +336,7 @@ def squared_distances(cell: jax.Array, fractional: jax.Array, slots: jax.Array) 
 
 
 def pair_energy(r2: jax.Array) -> jax.Array:
-    """Return the Lennard-Jones energy (eV) of the listed pairs of atoms inside a hard cutoff."""
+    """Return the Lennard-Jones energy (eV) of the listed pairs inside the cutoff."""
     inside = (r2 > 0) & (r2 < _R_CUT**2)
     inverse = (_SIGMA**2) / jnp.where(inside, r2, jnp.ones_like(r2))
     sixth = inverse * inverse * inverse
@@ -344,11 +344,11 @@ def pair_energy(r2: jax.Array) -> jax.Array:
 
 
 def crystal() -> DoctorRow:
-    """Compare distances and energy of a tilted crystal in jax (jitted and eager) with exact sums in numpy.
+    """Compare distances and energy of a tilted crystal in jax with exact sums.
 
-    On CPUs, jax 0.10.2 silently miscompiles a vmapped matrix-vector product that is followed by a reduction
-    (jax-ml/jax#39103). One coordinate of every displacement in a tilted box is then wrong. The bug affects
-    only arrays with more than 16,384 rows, so tests of smaller arrays pass.
+    On CPUs, jax 0.10.2 miscompiles a vmapped matrix-vector product that is followed by a reduction
+    (jax-ml/jax#39103). One coordinate of every displacement in a tilted box is then wrong. Only arrays with
+    more than 16,384 rows are affected.
     """
     cell, fractional, slots = tilted_crystal()
     used = slots[:, 0] < len(fractional)
@@ -374,7 +374,7 @@ def crystal() -> DoctorRow:
 
 
 def digest(steps: int = 50) -> str:
-    """Return the SHA-256 digest of a short jitted simulation; the digest must be the same in all processes.
+    """Return the SHA-256 digest of a short jitted simulation. All processes must give the same digest.
 
     Args:
         steps: number of velocity Verlet steps of 32 argon atoms.
@@ -409,7 +409,7 @@ def digest(steps: int = 50) -> str:
 
 
 def own_forces() -> DoctorRow:
-    """Compare mdnum's energy and forces of the system argon/tilted-500 with a direct sum in numpy."""
+    """Compare mdnum's energy and forces of argon/tilted-500 with a direct sum."""
     try:
         energy, force = worst_errors()
     except Exception as error:  # whatever keeps mdnum from computing forces here is what was asked for
@@ -435,7 +435,7 @@ def worst_errors() -> tuple[float, float]:
 def _lennard_jones(
     positions: np.ndarray, cell: np.ndarray, sigma: float, epsilon: float, r_cut: float
 ) -> tuple[float, np.ndarray]:
-    """Compute Lennard-Jones energy and forces by a direct sum over all pairs and neighboring images."""
+    """Compute Lennard-Jones energy and forces by a direct sum over pairs and images."""
     terms: list[np.ndarray] = []
     forces = np.zeros_like(positions)
     fractional = positions @ np.linalg.inv(cell)
@@ -465,7 +465,7 @@ class Child:
         )
 
     def answer(self, seconds: float) -> tuple[str | None, str]:
-        """Wait at most `seconds` for output; return (output, "") or (None, reason for missing output)."""
+        """Wait at most `seconds`. Return (output, "") or (None, reason for missing output)."""
         try:
             out, err = self.process.communicate(timeout=max(seconds, 0.1))
         except subprocess.TimeoutExpired:
@@ -488,7 +488,7 @@ def imports(child: Child, seconds: float) -> DoctorRow:
 
 
 def second_process(child: Child, here: str, seconds: float) -> DoctorRow:
-    """Test that a jitted simulation gives the same bits in another process, as required to resume runs."""
+    """Test that a jitted simulation gives the same bits in another process."""
     answer, why = child.answer(seconds)
     status = "info" if why == _LATE else answer == here
     return _row("second_process", status, here=here[:12], there=answer[:12] if answer else why)

@@ -1,8 +1,8 @@
 """Protection against importing Python code from the current folder in place of installed packages.
 
-With `-m` and `-c`, Python puts the current folder first on its import path. A file `jax.py` or `numpy.py` in
-an untrusted folder would then be imported in place of the package. Therefore mdnum starts every Python
-process with the option `-P`, which processes of Python's multiprocessing inherit.
+With `-m` and `-c`, Python puts the current folder first on its import path. A file `jax.py` in an untrusted
+folder would then be imported instead of the package. mdnum therefore starts every Python process with the
+option `-P`. Child processes of multiprocessing inherit this option.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from types import ModuleType
 
 
 def python(*words: str) -> list[str]:
-    """Return the command of a Python process that does not import modules from the current folder.
+    """Return the command of a Python process that imports nothing from the current folder.
 
     Args:
         words: arguments of the interpreter: "-m", a module, and its arguments, or "-c" and a program.
@@ -29,7 +29,7 @@ def python(*words: str) -> list[str]:
 
 
 def environment(**changes: str) -> dict[str, str]:
-    """Return environment variables with which a child process imports mdnum from the same location."""
+    """Return environment variables that make a child process import mdnum from the same location."""
     home = Path(__file__).resolve().parents[1]
     if home.name in ("site-packages", "dist-packages"):
         return {**os.environ, **changes}
@@ -39,9 +39,9 @@ def environment(**changes: str) -> dict[str, str]:
 
 
 def guard(parent: int) -> None:
-    """End this process when its parent process ends, and limit its memory to half of the machine's memory.
+    """End this process when its parent process ends. Limit its memory to half of the machine's memory.
 
-    On systems other than Linux, a process that executes a C function ends only after this function returns.
+    On systems other than Linux, a process ends only after a running C function has returned.
 
     Args:
         parent: process number of the parent process.
@@ -66,7 +66,7 @@ def guard(parent: int) -> None:
 
 
 def executed(file: Path, name: str) -> ModuleType:
-    """Execute a Python file as a module with the given name, and return this module.
+    """Execute a Python file as a module with the given name.
 
     Raises:
         BaseException: the code in the file raises this exception.
@@ -85,7 +85,7 @@ def executed(file: Path, name: str) -> ModuleType:
 
 
 def search_last(folder: str | Path, module: str | None = None) -> None:
-    """Append a folder to the end of the import path, so that files in the folder cannot hide packages.
+    """Append a folder to the import path. Files in this folder cannot hide installed packages.
 
     Args:
         folder: folder of the Python code that the user asked to run.

@@ -1,4 +1,4 @@
-"""Load a calculator by name, save an audit to a folder, and write a script that reproduces its findings."""
+"""Load a calculator by name, save an audit, and write a script that reproduces its findings."""
 
 from __future__ import annotations
 
@@ -31,9 +31,9 @@ STRUCTURES = "structures"  # where structures are kept that show a finding
 
 
 def load_calculator(words: str) -> LoadedCalculator:
-    """Find the named calculator, and create a calculator object at once so that errors appear immediately.
+    """Find the named calculator. One object is created at once, so that errors appear immediately.
 
-    A Python file is executed again for each calculator object, so that two objects share no arrays.
+    A Python file is executed again for each calculator object. Two objects thus share no arrays.
 
     Args:
         words: `package.module:Class(argument=value)` with literals as arguments; a Python file in which
@@ -171,7 +171,7 @@ def kept(folder: RunFolder) -> AuditState:
 
 
 def encoded(atoms: Atoms) -> str:
-    """Encode a structure as JSON without rounding; from its `info`, keep only text and numbers."""
+    """Encode a structure as JSON without rounding. Only text and numbers of its `info` are kept."""
     copy = atoms.copy()
     copy.info = {key: value for key, value in atoms.info.items() if isinstance(value, str | int | float)}
     copy.set_constraint()
@@ -179,7 +179,7 @@ def encoded(atoms: Atoms) -> str:
 
 
 def script(words: str, pairs: Sequence[str], units: Units = METAL) -> str:
-    """Return a script that shows, with ASE alone, that energy or forces of equivalent structures differ.
+    """Return a script that shows the error with ASE alone: equivalent structures, different energy or forces.
 
     Args:
         words: the calculator as the user named it.
@@ -192,7 +192,7 @@ def script(words: str, pairs: Sequence[str], units: Units = METAL) -> str:
 
 
 def _making(words: str) -> list[str]:
-    """Return the lines of a script that define make(), a function that creates the calculator."""
+    """Return lines that define make(), a function that creates the calculator."""
     spot = place(words)
     head = ["", "", "def make():"]
     if spot is None:

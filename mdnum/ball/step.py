@@ -1,7 +1,7 @@
 """A time step of the bouncing ball: integration schemes and contact models.
 
-Each integration scheme specifies the height from which contact is decided, and records this height. Products
-are rounded before they are added (no fused multiply-add), so that numpy reproduces every bit of the results.
+Each integration scheme decides contact from one height, and records this height. Products are rounded before
+they are added, so that numpy reproduces every bit of the results.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ class BallState(NamedTuple):
 
 
 class BallDecisions(NamedTuple):
-    """All decisions of a time step, in a format that is also used to impose decisions on a step."""
+    """All decisions of a time step. Decisions are imposed on a step in the same format."""
 
     # whether each ball is in contact, shape (balls,). Integers may be imposed instead: 0 or 1, and a negative
     # number where the step is to decide by itself
@@ -63,12 +63,12 @@ class BallRecord(NamedTuple):
 
 
 class Rounding(eqx.Module):
-    """Function that forces the rounding of a value, such as a product, before the value is used."""
+    """Function that forces the compiler to round a value."""
 
     zero: Int[Array, ""]  # an integer zero that the compiler must not know (see mdnum.numerics.exact)
 
     def __call__(self, x: Float[Array, "*shape"]) -> Float[Array, "*shape"]:
-        """Return x; the compiler is forced to round x to its dtype before x is used."""
+        """Return x, rounded to its dtype before it is used."""
         return fence(x, self.zero)
 
 
@@ -93,7 +93,7 @@ class Motion(NamedTuple):
 
 
 class Moved(NamedTuple):
-    """Result of a time step: height, velocity, acceleration for the next step, and the record."""
+    """Result of a time step."""
 
     y: Balls
     v: Balls
@@ -118,7 +118,7 @@ class Scheme(Protocol):
         ...
 
     def push(self, pull: Pull, motion: Motion) -> Moved:
-        """Make one time step with a contact force; the remaining penetration is not recorded yet."""
+        """Make one time step with a contact force. The remaining penetration is not recorded yet."""
         ...
 
 
@@ -131,7 +131,7 @@ class _Euler(eqx.Module):
     h: Any
 
     def push(self, pull, motion):
-        """Make one time step with a contact force; the height before the step decides contact."""
+        """Make one time step with a contact force. The height before the step decides contact."""
         y, v = motion.y, motion.v
         contact = motion.judge(y)
         a = pull(y, v, contact)
@@ -168,7 +168,7 @@ class BallVerlet(eqx.Module):
         return y, r(v + r(half * a))
 
     def push(self, pull, motion):
-        """Make one time step; the final height decides contact, and damping uses the half-step velocity."""
+        """Make one time step. The final height decides contact; damping uses the half-step velocity."""
         r = motion.rounding
         y, v, half = self._drift(motion.y, motion.v, motion.carried, r)
         contact = motion.judge(y)
@@ -193,7 +193,7 @@ class ImplicitMidpoint(eqx.Module):
         return r(y + r(self.h * middle)), r(v + r(self.h * a))
 
     def push(self, pull, motion):
-        """Make one time step with a contact force; the height in the middle of the step decides contact."""
+        """Make one time step with a contact force. The height in the middle of the step decides contact."""
         y, v, r, judge = motion.y, motion.v, motion.rounding, motion.judge
         half = r(0.5 * self.h)
         quarter = r(half * half)
@@ -266,7 +266,7 @@ class Contact(Protocol):
         ...
 
     def acceleration(self, y: Balls, v: Balls, free: Balls, contact: Touching, r: Rounding) -> Balls:
-        """Return the acceleration of a state, which some integration schemes use again in the next step."""
+        """Return the acceleration of a state. Some schemes use it again in the next step."""
         ...
 
 
@@ -274,7 +274,7 @@ class _Forceless(eqx.Module):
     """A contact model that resets the state and does not exert a force."""
 
     def acceleration(self, y, v, free, contact, r):
-        """Return the acceleration of free flight, because this contact model has no contact force."""
+        """Return the acceleration of free flight. This model has no contact force."""
         return free
 
 
@@ -282,7 +282,7 @@ class Penalty(eqx.Module):
     """Contact by a spring and a damper: the force is k p - damping v, where p is the depth below the floor.
 
     In a smooth contact, p is a softplus of -y (y: height). If contact is imposed, the force is -k y at any
-    height y. The force thus continues smoothly above the floor, like an imposed pair force beyond its cutoff.
+    height y. The force thus continues smoothly above the floor.
 
     Source: soft contact of the discrete element method (Cundall and Strack 1979).
     """
@@ -306,7 +306,7 @@ class Penalty(eqx.Module):
         return r(free + r(r(self.k * self.depth(y, contact)) - drag))
 
     def move(self, motion: Motion) -> Moved:
-        """Make one time step of an integration scheme with the contact force of this contact model."""
+        """Make one time step with the contact force of this model."""
         r = motion.rounding
 
         def pull(y, v, contact):
@@ -319,10 +319,9 @@ class Penalty(eqx.Module):
 class Projection(_Forceless):
     """Iterate y ← y + alpha k max(0, -y) until the stopping rule holds; then clamp y and apply restitution.
 
-    Each iteration multiplies the penetration by 1 - alpha k, so tol is reached from p0 after ceil(log(tol /
-    p0) / log(1 - alpha k)) iterations. With alpha k between 1 and 2, iterations overshoot; with alpha k = 2,
-    they never end. The floor is at 0 for any k: the value of k affects the final height only through the
-    remaining penetration.
+    Each iteration multiplies the penetration by 1 - alpha k. Hence p0 falls to tol
+    after ceil(log(tol / p0) / log(1 - alpha k)) iterations. Iterations overshoot for alpha k between 1
+    and 2. They never end for alpha k = 2. The floor is at 0 for any k. The value of k affects only the remaining penetration.
     """
 
     k: Any  # gain, dimensionless; what is learned in place of a stiffness
@@ -334,7 +333,7 @@ class Projection(_Forceless):
     derivative: Any = None
 
     def move(self, motion: Motion) -> Moved:
-        """Make one time step: flight, and a projection to the floor if the flight ends below the floor."""
+        """Make one time step of free flight. A ball below the floor is then projected to the floor."""
         r, policy = motion.rounding, motion.policy
         height, v = motion.integrator.fly(motion.y, motion.v, motion.free, r)
         contact = motion.judge(height)
@@ -372,9 +371,9 @@ class Projection(_Forceless):
 class Impact(_Forceless):
     """Instantaneous impact: v ← -restitution v at the floor.
 
-    With `EventLocated`, the impact takes place at its exact time, and the flight continues for the rest of
-    the step. With another scheme, a ball below the floor is put on the floor at the end of the step, and its
-    velocity is reset. The reset causes an error of order h in the state and of order 1 in the derivative.
+    With `EventLocated`, the impact takes place at its exact time. The flight then continues until the end of
+    the step. With another scheme, a ball below the floor is put on the floor at the end of the step. Its
+    velocity is reset. This causes an error of order h in the state and of order 1 in the derivative.
     """
 
     restitution: Any = 0.8  # speed after over speed before
@@ -455,7 +454,7 @@ class Impact(_Forceless):
 
 
 def lowest(y, v, a, time, r):
-    """Return the lowest height of a parabolic flight of given duration, at the end or at the vertex."""
+    """Return the lowest height of a parabolic flight of given duration."""
     end = r(y + r(time * r(v + r(r(0.5 * time) * a))))
     up = (a > 0) & (v < 0) & (r(-v) < r(a * time))
     safe = jnp.where(up, a, jnp.ones_like(a))
@@ -463,9 +462,9 @@ def lowest(y, v, a, time, r):
 
 
 def time_of_impact(y, v, a, r):
-    """Return the first time (s) at which a parabolic flight meets the floor, or infinity if it never does.
+    """Return the first time (s) at which a parabolic flight meets the floor, or infinity.
 
-    The relative error of the impact time is a few units of roundoff, because the formula avoids cancellation.
+    The relative error is a few units of roundoff, because the formula avoids cancellation.
     """
     inside = r(r(v * v) - r(r(2.0 * a) * y))
     # the argument is masked as well, so that no derivative is taken where there is no root

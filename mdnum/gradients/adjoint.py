@@ -1,12 +1,11 @@
 """Reverse-mode derivatives of a simulation at its recorded states and decisions.
 
-With jax.value_and_grad, the forward pass rounds differently from an ordinary run, and after some thousand
-steps makes other decisions. This module therefore makes and records an ordinary run first.
+With jax.value_and_grad, the forward pass rounds differently from an ordinary run. After some thousand steps
+it makes other decisions. This module therefore makes and records an ordinary run first.
 
-A conservative force is a gradient, so its Jacobian J is symmetric: the transpose of J times a vector equals J
-times that vector. For a pair potential, J times a vector is a sum over neighbors, like the forces, and
-requires no scatter operation. For other energies, J times a vector is a directional derivative of the forces.
-Because the Jacobian is symmetric, reverse mode needs no record of the operations within a step.
+A conservative force is a gradient, so its Jacobian J is symmetric. For a pair potential, J times a vector is
+a sum over neighbors, like the forces. For other energies, it is a directional derivative of the forces.
+Reverse mode therefore needs no record of the operations within a step.
 """
 
 from __future__ import annotations
@@ -44,7 +43,7 @@ ALL = frozenset((MODEL, SCALE, FORCE, WEIGHT))
 
 
 class ForceCotangents(NamedTuple):
-    """Cotangents (derivatives of the loss) with respect to the inputs of one evaluation of forces."""
+    """Derivatives of the loss (cotangents) with respect to the inputs of one force evaluation."""
 
     x: Float[Array, "3 atoms"]  # on the positions
     model: Any  # on the parameters, a pytree of arrays like theirs; zeros where it was not asked for
@@ -64,7 +63,7 @@ def pull_back(
     onto_virial: Float[Array, "*axes"],
     wanted: frozenset[str] = frozenset(),
 ) -> ForceCotangents:
-    """Propagate cotangents backward through one evaluation of forces, energy and virial at given decisions.
+    """Propagate cotangents backward through one evaluation of forces, energy and virial.
 
     Args:
         x: sorted, wrapped positions, length. bits: the packed decisions that this evaluation used.
@@ -109,15 +108,15 @@ def _of_pairs(force, x, tables, bits, onto_force, onto_energy, onto_virial, want
         return r2, jnp.where(inside, d[0] * dw[0] + d[1] * dw[1] + d[2] * dw[2], 0)
 
     def virials(d, r2):
-        """Return d·V·d for the pair vector d and the virial's cotangent V, and also V·d if V is a tensor."""
+        """Return d·V·d for the pair vector d and the virial's cotangent V; also V·d if V is a tensor."""
         if not virial.ndim:
             return virial * r2, None
         turned = [reduce(add, (virial[a, b] * d[b] for b in range(3))) for a in range(3)]
         return reduce(add, (d[a] * turned[a] for a in range(3))), turned
 
     def through(r2, along, inside, types, weights):
-        """Return a function that computes energy and du/d(r²) of each neighbor slot. Also return the
-        parameters of every slot, and the cotangents of energy and du/d(r²).
+        """Return a function that computes energy and du/d(r²) of each neighbor slot. Also return slot
+        parameters, and the cotangents of energy and du/d(r²).
         """
         # each slot has parameters of its own, so that no sum over slots stands inside the loop
         slots = jax.tree.map(lambda leaf: jnp.broadcast_to(of_type(leaf, types), r2.shape), (own, at))
@@ -131,8 +130,8 @@ def _of_pairs(force, x, tables, bits, onto_force, onto_energy, onto_virial, want
         return ended, slots, onto
 
     def with_shared(r2, along, inside, types, weights):
-        """Compute du/d(r²) of neighbor slots, and cotangents of r², slot parameters and shared parameters. A
-        single reverse pass computes all cotangents; for a neural network, one pass is cheaper than two.
+        """Compute du/d(r²), and cotangents of r², slot parameters and shared parameters. One reverse pass
+        computes all cotangents. For a neural network, one pass is cheaper than two.
         """
         ended, slots, onto = through(r2, along, inside, types, weights)
 
@@ -146,14 +145,14 @@ def _of_pairs(force, x, tables, bits, onto_force, onto_energy, onto_virial, want
         return slope, *back(onto)
 
     def onto_weights(r2, along, inside, types, weights, others):
-        """Compute the cotangents of the atoms' weights from each neighbor slot (two slots for each pair)."""
+        """Compute the cotangents of the atoms' weights from each neighbor slot."""
         onto = jnp.where(inside, energy, 0), -2 * jnp.where(inside, along, 0)
         by = jax.vjp(lambda *weights: model.evaluate(r2, types, at, *weights), *weights)[1](onto)
         return [leaf * w for leaf, w in zip(jax.tree.leaves(by), others, strict=True)]
 
     def terms(d, dw, inside, types) -> tuple[list[Array], Any]:
-        """Return, in this order, each neighbor slot's contributions to the cotangents of positions, forces,
-        box scale and pair-type parameters. Also return each block's contributions for shared parameters.
+        """Return each neighbor slot's contributions to the cotangents. Their order: positions, forces, box
+        scale, pair-type parameters. Also return each block's contributions for shared parameters.
         """
         weights, several = factors(model, dw[3:]), len(dw[3:]) // 2
         r2, along = distances(d, dw, inside)
@@ -220,16 +219,14 @@ def _of_pairs(force, x, tables, bits, onto_force, onto_energy, onto_virial, want
 
 
 def _differences(cell, own, other):
-    """Return differences of two atoms' positions and vectors, products of weights, and weights of atom 2."""
+    """Return differences of positions and vectors, products of weights, and weights of atom 2."""
     d = [b - a for a, b in zip(own[:6], other[:6], strict=True)]
     products = (a * b for a, b in zip(own[6:], other[6:], strict=True))
     return [*cell.minimum_image(*d[:3]), *d[3:], *products, *other[6:]]
 
 
 def _summed(terms, columns, cell, tables: Tables, bits, in_one_loop: bool):
-    """For each atom, sum the contributions of all neighbor slots to the cotangents; for shared parameters,
-    sum the contributions over all atoms.
-    """
+    """Sum the contributions of all neighbor slots for each atom. Sum shared parameters over all atoms."""
 
     def pair(own, other, types, inside):
         # padding is nowhere
@@ -257,7 +254,7 @@ def _summed(terms, columns, cell, tables: Tables, bits, in_one_loop: bool):
 
 
 def _added(totals: tuple[Array, ...], terms: list[Array]) -> tuple[Array, ...]:
-    """Add the terms of four neighbor slots in a fixed order, which lets the compiler vectorize over atoms."""
+    """Add the terms of four neighbor slots in a fixed order. The compiler can then vectorize over atoms."""
     out = []
     for total, term in zip(totals, terms, strict=True):
         for k in range(term.shape[0]):
@@ -304,10 +301,10 @@ def _of_energy(force, x, tables, bits, onto_force, onto_energy, onto_virial, wan
 class AdjointCarry(NamedTuple):
     """Cotangents that a reverse pass propagates from each step to the preceding step.
 
-    A trace is an `AdjointCarry` that contains the cotangents at every step, but not those of the first frame.
-    Row k of a trace contains the cotangents of positions and half-kicked velocities at the beginning of step
-    first + k. Row k excludes contributions of the cutoff crossings that lead to the state at step first + k.
-    Atoms in a trace are in the order of the neighbor list. Unused rows at the end of a trace are undefined.
+    A trace is an `AdjointCarry` with the cotangents at every step except the first frame.
+    Row k contains the cotangents of positions and half-kicked velocities at the beginning of step first + k.
+    Row k excludes cutoff crossings that lead to the state at step first + k. Atoms in a trace are in the
+    order of the neighbor list. Unused rows at the end of a trace are undefined.
     """
 
     x: Float[Array, "3 atoms"]  # cotangent of the positions at the step that comes next in time
@@ -334,7 +331,7 @@ def reverse(
     progress: Callable[[int, int], None] | None = None,
     watch: Callable[[TapeStretch, AdjointCarry], None] | None = None,
 ) -> tuple[Cotangents, list[Crossings]]:
-    """Compute derivatives of the loss of a recorded run with respect to all inputs of the run.
+    """Compute derivatives of the loss of a recorded run with respect to its inputs.
 
     Args:
         wanted: derivatives to compute beyond the start: MODEL, SCALE, FORCE (the integrator's numbers),
@@ -365,7 +362,7 @@ def reverse(
 
 
 class StretchReversal:
-    """State of a reverse pass through a recorded run, from the last step to the first; see `reverse`.
+    """State of a reverse pass through a recorded run; see `reverse`.
 
     Attributes:
         carry: the cotangents at the current step, atoms in the user's order. guard: radial speed below which
@@ -403,7 +400,7 @@ class StretchReversal:
         )
 
     def arguments(self, stretch: TapeStretch) -> tuple[Any, ...]:
-        """Return the arguments of the function `transposed` for a stretch of steps with one neighbor list."""
+        """Return the arguments of `transposed` for a stretch of steps with one neighbor list."""
         simulation, order = self.tape.simulation, stretch.table.order
         self.met = None if self.guard is None else crossings(simulation, stretch, self.guard)
         tape, tables = self.tape, simulation.tables(stretch.table)
@@ -415,12 +412,12 @@ class StretchReversal:
         )  # fmt: skip
 
     def through(self, stretch: TapeStretch) -> tuple[Float[np.ndarray, "room most"], AdjointCarry]:
-        """Return the cotangents of every step of a stretch, and the weights of its cutoff crossings."""
+        """Return the cotangents of every step, and the weights of the cutoff crossings."""
         self.carry, (weights, trace) = transposed(*self.arguments(stretch))
         return np.asarray(weights), trace
 
     def cotangents(self) -> Cotangents:
-        """Return the derivatives of the loss after the reverse pass has reached the start of the run."""
+        """Return the derivatives of the loss after the reverse pass."""
         simulation, carry, start = self.tape.simulation, self.carry, self.tape.start.state
         through = carry.integrator, carry.x, carry.v
         if jax.tree.leaves(carry.extra):
@@ -452,9 +449,9 @@ def transposed(
     """Propagate cotangents backward through a stretch of steps with one neighbor list.
 
     The function returns the cotangents at the first step, one weight per cutoff crossing, and the cotangents
-    at every step. JAX transposes the part of a step between two force evaluations. With a linear `KickDrift`
-    integrator, the derivative of a step does not depend on the forces, so that forces need not be recorded.
-    For derivatives with respect to integrator parameters, `pull_back` computes the forces.
+    at every step. JAX transposes the part of a step between two force evaluations. The derivative of a step
+    with a linear `KickDrift` integrator does not depend on the forces. Forces are then not recorded. For
+    derivatives with respect to integrator parameters, `pull_back` computes the forces.
     """
     loss, origin, around, onto_total, pace = looking
     order, moves = tables.order, integrator.moves_cell
@@ -477,7 +474,7 @@ def transposed(
         return end.x, end.kicked, ahead, end.cell.matrix, end.v
 
     def look(row):
-        """Convert cotangents of the summed observations to cotangents of a frame and of the first frame."""
+        """Convert cotangents of the observations to cotangents of a frame and of the first frame."""
 
         def seen_at(x, v, potential, virial, origin, timestep, *box):
             here = (in_box(around, *box) if box else around)._replace(timestep=timestep)

@@ -1,13 +1,12 @@
 """Summation orders and their error bounds.
 
-A summation order is used in two ways. The force loop of molecular dynamics passes blocks of terms and carries
-a partial sum from block to block. The terms of a whole neighbor list are therefore never stored at once. A
-summation order that needs all terms stores the terms and adds them at the end. Code outside of the force loop
-passes a whole array and gets the sum over the first axis. The sum is rounded after every addition and has the
-same bits as a numpy loop in the dtype of the terms. Unlike the summation orders of this module, `jnp.sum`
-adds 16-bit terms in float32, which hides the effect of a 16-bit accumulator.
+A summation order is used in two ways. The force loop passes blocks of terms, and carries a partial sum from
+block to block. The terms of a whole neighbor list are therefore never stored at once. If an order needs all
+terms, they are stored and added at the end. Code outside of the force loop passes a whole array, and gets the
+sum over its first axis. The sum is rounded after every addition. A numpy loop in the dtype of the terms gives
+the same bits. `jnp.sum`, in contrast, adds 16-bit terms in float32.
 
-The derivative of every sum is that of the exact sum, because rounding and order have no derivative.
+The derivative of every sum is that of the exact sum.
 """
 
 from __future__ import annotations
@@ -53,24 +52,24 @@ _compiled = partial(jax.jit, static_argnums=0)(_summed)
 
 
 class Reduction:
-    """Base class of summation orders; terms arrive in blocks, or in one array that is summed over axis 0.
+    """Base class of summation orders.
 
     A subclass defines the sum of a whole array. By default, blocks are stacked and summed at the end.
     """
 
     def within(self, total: jax.Array, terms: Sequence[jax.Array]) -> tuple[jax.Array, jax.Array | None]:
-        """Process one block of terms; return the partial sum, and numbers that `finish` adds (or None)."""
+        """Process a block of terms. Return the partial sum, and numbers for `finish` (or None)."""
         return total, jnp.stack(list(terms))
 
     def finish(self, total: jax.Array, blocks: jax.Array | None) -> jax.Array:
-        """Return the sum, from the partial sum and the stacked results of the blocks (first axis: blocks)."""
+        """Return the sum, from the partial sum and the stacked results of the blocks."""
         assert blocks is not None
         return self(blocks.reshape(-1, *blocks.shape[2:]))
 
     def __call__(
         self, terms: Float[Array, "n ..."], zero: Int[Array, ""] | None = None
     ) -> Float[Array, "..."]:
-        """Return the sum over the first axis, with rounding after every addition in the dtype of the terms.
+        """Return the sum over the first axis, rounded after every addition.
 
         Args:
             terms: the terms of the sum.
@@ -83,26 +82,26 @@ class Reduction:
         return _compiled(self, terms, zero)
 
     def sum_of(self, terms: jax.Array, add: Add) -> jax.Array:
-        """Return the sum of one or more terms; the function `add` adds two numbers and rounds the result."""
+        """Return the sum of one or more terms. The function `add` adds two numbers and rounds."""
         raise NotImplementedError(type(self).__name__)
 
     def bound(self, terms: Float[np.ndarray, "n ..."]) -> Float[np.ndarray, "..."]:
         """Return a bound on the difference between the computed and the exact sum, in float64.
 
-        The bound holds if no sum overflows or is subnormal. XLA on a CPU flushes subnormal numbers to zero in
+        The bound holds if no sum overflows or is subnormal. On CPUs, XLA sets subnormal numbers to zero in
         every dtype except float16.
         """
         factor = gamma(self.depth(len(terms)), terms.dtype)
         return np.asarray((factor if factor >= 0 else np.inf) * np.abs(terms.astype(np.float64)).sum(axis=0))
 
     def depth(self, n: int) -> int:
-        """Return the largest number of additions that involve the same term in a sum of n terms."""
+        """Return the largest number of additions for one term in a sum of n terms."""
         return max(n - 1, 0)
 
 
 def in_order(terms, add, start=None):
-    """Return ((0 + t0) + t1) + ... (or with `start` instead of 0) by a scan, which XLA does not reorder. The
-    scan is unrolled, because a step of a loop costs more than an addition.
+    """Return ((0 + t0) + t1) + ... by a scan. XLA does not reorder a scan. The scan is unrolled, because loop
+    steps are slower than additions.
     """
     total, _ = lax.scan(
         lambda total, term: (add(total, term), None),
@@ -121,7 +120,7 @@ class Sequential(Reduction):
     order: Literal["forward", "reversed"] = "forward"
 
     def within(self, total, terms):
-        """Add the terms to the partial sum in forward order, or return the terms if the order is reversed."""
+        """Add the terms in forward order. In reversed order, return the terms."""
         if self.order == "reversed":
             return super().within(total, terms)
         for term in terms:
@@ -129,7 +128,7 @@ class Sequential(Reduction):
         return total, None
 
     def finish(self, total, blocks):
-        """Return the partial sum if the order is forward; add the stored terms if the order is reversed."""
+        """Return the partial sum. In reversed order, add the stored terms."""
         return total if self.order == "forward" else super().finish(total, blocks)
 
     def sum_of(self, terms: jax.Array, add: Add) -> jax.Array:
@@ -145,7 +144,7 @@ def _tree(terms: list[jax.Array]) -> jax.Array:
 
 
 def _levels(terms, add, width: int):
-    """Sum by a tree: add groups of `width` adjacent terms from left to right until one number is left."""
+    """Sum by a tree: add groups of `width` adjacent terms until one number is left."""
     while terms.shape[0] > 1:
         count = terms.shape[0]
         groups = -(-count // width)
@@ -182,7 +181,7 @@ class Blocked(Reduction):
         return _levels(terms, add, self.width)
 
     def depth(self, n: int) -> int:
-        """Return the number of additions of one term: (width - 1) times the number of levels."""
+        """Return (width - 1) times the number of levels."""
         levels = 0
         while n > 1:
             n, levels = -(-n // self.width), levels + 1
@@ -211,7 +210,7 @@ class Permuted(Reduction):
     seed: int = 0  # of the order; the same for every sum of as many terms
 
     def sum_of(self, terms: jax.Array, add: Add) -> jax.Array:
-        """Add the terms in a random order, which depends only on the seed and the number of terms."""
+        """Add the terms in a random order. It depends only on the seed and the number of terms."""
         return in_order(terms[np.random.default_rng(self.seed).permutation(len(terms))], add)
 
 
@@ -219,19 +218,19 @@ class Permuted(Reduction):
 class Halves(Reduction):
     """The sum of the first half of the terms plus the sum of the second half, each added sequentially.
 
-    Two scatter operations over pairs, one for each atom of a pair, add the two halves one after the other.
+    Scatter operations over pairs, one for each atom of a pair, add the two halves in turn.
     The error is at most gamma_{n/2} * sum |terms| for n terms.
     """
 
     def sum_of(self, terms: jax.Array, add: Add) -> jax.Array:
-        """Add the sums of both halves; if the number of terms is odd, the second half has one term more."""
+        """Add the sums of both halves. The second half has the odd term."""
         half = terms.shape[0] // 2
         if half == 0:
             return in_order(terms, add)
         return add(in_order(terms[:half], add), in_order(terms[half:], add))
 
     def depth(self, n: int) -> int:
-        """Return the number of additions in the longer half of the terms, plus one for the final addition."""
+        """Return the number of additions in the longer half, plus one."""
         return n - n // 2 if n > 1 else 0
 
 
@@ -239,8 +238,8 @@ class Halves(Reduction):
 class Twice(Reduction):
     """A sequential sum in two passes, each of which adds all terms divided by 2.
 
-    A scatter operation over a list that stores each pair for both atoms adds each halved term twice. The
-    error is at most gamma_{2n} * sum |terms| for n terms, if no halved term is subnormal.
+    A scatter operation adds each halved term twice if the list stores each pair for both atoms. The error is
+    at most gamma_{2n} * sum |terms| for n terms without subnormal halves.
     """
 
     def sum_of(self, terms: jax.Array, add: Add) -> jax.Array:
@@ -249,7 +248,7 @@ class Twice(Reduction):
         return in_order(halves, add, in_order(halves, add))
 
     def depth(self, n: int) -> int:
-        """Return the largest number of additions that involve the same term, over both passes of the sum."""
+        """Return the largest number of additions for one term, over both passes."""
         return max(2 * n - 1, 0)
 
 
@@ -257,14 +256,14 @@ class Twice(Reduction):
 class Sorted(Reduction):
     """A sequential sum of terms sorted by magnitude and sign, so that the storage order does not matter.
 
-    Ascending order has the smallest error if all terms have the same sign (Higham 2002, 4.2), and descending
-    order if terms cancel.
+    Ascending order has the smallest error if all terms have the same sign (Higham 2002, 4.2). Descending
+    order is best if terms cancel.
     """
 
     order: Literal["ascending", "descending"] = "ascending"  # of magnitudes, "ascending" or "descending"
 
     def sum_of(self, terms: jax.Array, add: Add) -> jax.Array:
-        """Sort the terms along the first axis, and add the terms in this order."""
+        """Sort the terms along the first axis and add them."""
         _, terms = lax.sort((jnp.abs(terms), terms), dimension=0, num_keys=2)
         return in_order(terms if self.order == "ascending" else terms[::-1], add)
 
@@ -289,8 +288,8 @@ class _Compensated(Reduction):
 class Kahan(_Compensated):
     """Compensated summation: the error of each addition is subtracted from the next term (Kahan 1965).
 
-    The error is at most (2u + O(n u²)) * sum |terms|. The compensation fails for a term that is much larger
-    than the partial sum. Source: Kahan, CACM 8, 40 (1965).
+    The error is at most (2u + O(n u²)) * sum |terms|. The compensation fails for a term much larger than the
+    partial sum. Source: Kahan, CACM 8, 40 (1965).
     """
 
     def sum_of(self, terms: jax.Array, add: Add) -> jax.Array:
@@ -314,7 +313,7 @@ class Neumaier(_Compensated):
     """
 
     def sum_of(self, terms: jax.Array, add: Add) -> jax.Array:
-        """Sum the terms with four additions for each term, and one addition at the end."""
+        """Sum the terms with four additions for each term, and a final one."""
 
         def step(carry, term):
             total, lost = carry

@@ -1,4 +1,4 @@
-"""Estimates of whether time step and cutoff are adequate for a configuration and a potential."""
+"""Estimates of whether the time step and the cutoff are adequate."""
 
 from __future__ import annotations
 
@@ -18,12 +18,11 @@ _NODES, _FEWER, _AGREE = 200, 100, 1e-3
 
 
 def fastest_period(simulation: Simulation, positions: Float[np.ndarray, "atoms 3"]) -> float | None:
-    """Period of the fastest vibration, in the user's time unit, or None if there is no vibrational mode.
+    """Period of the fastest vibration, in the user's time unit. None if there is no vibration.
 
-    The largest eigenvalue of the mass-weighted Hessian is found by a Lanczos iteration with finite
-    differences of forces. Forces are shifted to zero at the cutoff, to avoid jumps when pairs cross the
-    cutoff between two evaluations. Force-shifting the potential changes the second derivatives of the energy
-    only by a small transverse term.
+    A Lanczos iteration finds the largest eigenvalue of the mass-weighted Hessian. It uses finite differences
+    of forces. Forces are shifted to zero at the cutoff, because pairs may cross the cutoff between two
+    evaluations. This shift changes the Hessian only by a small transverse term.
 
     Args:
         simulation: the system as objects.
@@ -57,7 +56,7 @@ def fastest_period(simulation: Simulation, positions: Float[np.ndarray, "atoms 3
 
 
 def beyond_cutoff(simulation: Simulation, volume: float | None = None) -> Mapping[str, float] | None:
-    """Tail corrections to energy and pressure for pairs beyond the cutoff, where g(r) = 1 is assumed.
+    """Tail corrections to energy and pressure for pairs beyond the cutoff. They assume g(r) = 1.
 
     Args:
         simulation: the system as objects.
@@ -77,7 +76,7 @@ def beyond_cutoff(simulation: Simulation, volume: float | None = None) -> Mappin
 
 
 def _beyond(simulation: Simulation, nodes: int, volume: float | None) -> tuple[float, float]:
-    """Integrate the tail corrections to energy per atom and pressure from the cutoff to infinity."""
+    """Integrate the tail corrections from the cutoff to infinity."""
     density = simulation.atoms / (volume or simulation.cell.volume)
     share = np.bincount(simulation.species) / simulation.atoms
     node, weight = np.polynomial.legendre.leggauss(nodes)

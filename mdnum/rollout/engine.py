@@ -1,8 +1,8 @@
-"""Control of a simulation run: neighbor lists, calls of the compiled time-stepping loop, and records.
+"""Control of a simulation run.
 
-The engine builds a neighbor list, starts the compiled loop over the steps that use it, and yields the loop's
-records. The caller processes a record while the device computes the next one, because a record is yielded
-only after the next loop has been started.
+The engine builds a neighbor list and starts the compiled loop over the steps that use this list. It then
+yields the records of the loop. A record is yielded after the next loop has been started. The caller thus
+processes a record while the device computes the next one.
 """
 
 from __future__ import annotations
@@ -85,13 +85,13 @@ class Segment:
         return self.first + self.rows - 1
 
     def rows_of(self, name: str) -> np.ndarray:
-        """Return a recorded quantity at all steps; steps are recomputed if the record lacks this quantity."""
+        """Return a recorded quantity at all steps. Unrecorded steps are recomputed."""
         lacks = self.changes is not None and name in ("x", "v", "images", "bits")
         return np.asarray(getattr(self.again() if lacks else self.record, name))[: self.rows]
 
     @cached_property
     def cells(self) -> tuple[Cell, ...]:
-        """The simulation box at each step, or an empty array if the box is fixed."""
+        """The simulation box at each step. The array is empty if the box is fixed."""
         return self.record.boxes(self.rows, self.cell.pbc)
 
     def cell_of(self, row: int) -> Cell:
@@ -100,11 +100,11 @@ class Segment:
 
     @property
     def last_positions(self) -> Float[Array | np.ndarray, "3 atoms"]:
-        """Return wrapped positions at the last step of the segment, in the user's order of atoms."""
+        """Return the wrapped positions at the last step, in the user's order of atoms."""
         return self.unsorted("x", self.rows - 1).T if self.closes == "blow-up" else self.state.x_before
 
     def unsorted(self, name: str, row: int) -> np.ndarray:
-        """Return a recorded quantity at one step in the user's order of atoms, shape (atoms, 3)."""
+        """Return a recorded quantity at one step, shape (atoms, 3), in the user's order of atoms."""
         if name == "x" and row == 0:
             return np.asarray(self.start.x).T
         if name == "x" and row == self.rows - 1 and self.closes != "blow-up":
@@ -127,11 +127,11 @@ class Start:
 
     @property
     def reference(self) -> Float[np.ndarray, "atoms 3"]:
-        """Return the positions at which the neighbor list was built, shape (atoms, 3), in float64."""
+        """Return the positions at which the neighbor list was built, shape (atoms, 3), float64."""
         return np.asarray(self.home, np.float64).T
 
     def check_box(self, simulation: Simulation, which: int = -1) -> None:
-        """Raise `InputError` if the box of the state is too narrow for the cutoff plus the skin."""
+        """Raise `InputError` if the box is too narrow for the cutoff plus the skin."""
         cell = jax.tree.map(np.asarray, self.state.cells[which])
         check_radius(cell, simulation.r_cut, simulation.rule.skin)
 
@@ -165,7 +165,7 @@ class Start:
 
 
 def first_state(simulation: Simulation) -> Start:
-    """Return the initial state of a run, with wrapped positions and the velocities of the system."""
+    """Return the initial state of a run, with wrapped positions."""
     dtype = simulation.policy.dtype("state")
     positions, velocities = simulation.first_frame()
     wrapped, images = wrap_positions(simulation.cell, positions)
@@ -183,7 +183,7 @@ def first_state(simulation: Simulation) -> Start:
 
 
 def room_for(rows: int, per_row: int) -> int:
-    """Return the number of time steps for which memory is allocated: a power of two, at least `rows`."""
+    """Return the number of steps for which memory is allocated, a power of two of at least `rows`."""
     few = max(2, min(_MOST_ROWS, _SMALL_BYTES // per_row))
     return 1 << max(few.bit_length() - 1, rows.bit_length())
 
@@ -248,7 +248,7 @@ class Engine:
         self.leaves = tuple(leaves)
 
     def _room(self, words: int) -> int:
-        """Return the number of time steps that a record can hold, a power of two within the memory limit."""
+        """Return the number of steps that a record can hold. It is a power of two within the memory limit."""
         kept = self.record and self.rows
         per_row = self.simulation.atoms * (2 * 24 + 12 + words) if kept else 64
         per_row += sum(leaf.size * 8 for leaf in jax.tree.leaves(self._inputs))
@@ -257,7 +257,7 @@ class Engine:
         return min(1 << (rows.bit_length() - 1), room_for(int(self.last + 1), per_row))
 
     def take(self, turn: int, words: int) -> EpochRecord:
-        """Return one of two buffers for a record; the buffer is donated to the loop that fills it."""
+        """Return one of two buffers for a record. The loop that fills the buffer takes it over (donation)."""
         rows, held, most = self._room(words), self._records[turn], self.program.most
         self._records[turn] = None
         # as many as a list's life brings, or a large system sorts its atoms several times for one list
@@ -274,7 +274,7 @@ class Engine:
         self._records[turn] = record
 
     def segments(self) -> Iterator[Segment]:
-        """Yield groups of consecutive time steps (segments), until the run has ended or failed."""
+        """Yield groups of consecutive steps (segments) until the run ends or fails."""
         here, turn, held = self.start, 0, None
         listed = self._listed(here)
         waiting: Segment | None = None
@@ -295,7 +295,7 @@ class Engine:
                 listed = self._listed(here)
 
     def again(self, start: Start) -> Segment:
-        """Recompute the time steps that follow a given state; the results are the same bit for bit.
+        """Recompute the steps that follow a given state. The results are identical bit for bit.
 
         Args:
             start: state at which a segment of this engine began (`resume_point` of the previous segment).
@@ -307,7 +307,7 @@ class Engine:
         return made
 
     def _listed(self, start: Start) -> tuple[PairTable, Tables]:
-        """Build the neighbor list for a state; return the list, and its tables for the compiled loop."""
+        """Build the neighbor list for a state. Return the list, and its tables for the compiled loop."""
         cell = self._cell
         if self._moves:
             cell = jax.tree.map(np.asarray, start.state.cells[-1])
@@ -339,7 +339,7 @@ class Engine:
     def _segment(
         self, listed, start: Start, held, turn: int, begun: tuple[EpochOutcome, EpochRecord]
     ) -> tuple[Segment, np.ndarray | jax.Array | None]:
-        """Wait for the compiled loop; return its recorded steps, and the decisions at its last step."""
+        """Wait for the compiled loop. Return its recorded steps, and the decisions at its last step."""
         outcome, record = begun
         rows, rebuild, finite, _ = np.asarray(outcome.flags).tolist()
         while (changes := record.changes) is not None and finite and changes.found > len(changes.pairs):
@@ -365,7 +365,7 @@ class Engine:
         return segment, last
 
     def _with_rows(self, start: Start, last: int) -> EpochRecord:
-        """Recompute the steps from a state to a last step with the same neighbor list; record every step."""
+        """Recompute and record every step from a state to a last step, with the same neighbor list."""
         engine = Engine(self.simulation, last, start=start, pins=self.pins)
         parts: list[list[Any]] = [
             [np.array(segment.rows_of(name)) for name in EpochRecord._fields[:-2]]
@@ -375,13 +375,13 @@ class Engine:
         return EpochRecord(*whole)
 
     def _pinned(self, table: PairTable, first: int, words: int) -> tuple[UInt8[np.ndarray, "..."], ...]:
-        """Return the decisions imposed on the next steps, and their mask (empty if there are none)."""
+        """Return the decisions imposed on the next steps, and their mask (or empty arrays)."""
         if self.pins is None:
             return ()
         return self.pins.rows(table, first, self._room(words), self.simulation.channels)
 
     def failure(self, outcome: EpochOutcome) -> str:
-        """Return the name of the failure that ended the time steps, or an empty string if there was none."""
+        """Return the name of the failure that ended the run, or an empty string."""
         _, rebuild, finite, runaway = np.asarray(outcome.flags).tolist()
         if not finite:
             return "blow-up"
@@ -403,7 +403,7 @@ class Engine:
 
 
 def resume_point(segment: Segment) -> Start:
-    """Return the state from which a run continues after a recorded group of steps (a segment)."""
+    """Return the state from which a run continues after a segment."""
     state, slots = segment.state, segment.table.slots
     if segment.due:
         return Start(state, state.x, segment.last + 1, segment.epoch + 1, slots)

@@ -1,4 +1,4 @@
-"""Metadata of parquet files: the unit and description of every column, and the run that wrote the file."""
+"""Metadata of parquet files: the unit and meaning of each column, and the run."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ _DECLARED: Mapping[str, Mapping[str, Sequence[str]]] = beside(__file__)
 
 
 def meaning(table: str, column: str, own: Mapping[str, Mapping[str, Any]] | None = None) -> Sequence[str]:
-    """Return the unit (such as "energy/length") and the description of a column; empty if unknown."""
+    """Return the unit (such as "energy/length") and the description of a column; "" if unknown."""
     if own is not None:
         said = _found(own.get(table, {}), column)
         return (_found(_DECLARED["columns"], said) if isinstance(said, str) else said) or ("", "")
@@ -33,9 +33,9 @@ def _json(value: Any) -> str:
 
 
 def described(schema: pa.Schema, table: str, about: Mapping[str, Any], own: Any = None) -> pa.Schema:
-    """Return a parquet schema with metadata of the run (keys `mdnum.*`) and of columns (unit, description).
+    """Return a parquet schema with metadata of the run (keys `mdnum.*`) and of the columns.
 
-    `mdnum.columns` repeats the metadata of columns as JSON, for programs that cannot read column metadata.
+    `mdnum.columns` repeats the metadata of columns as JSON. Some programs cannot read column metadata.
 
     Args:
         about: version, kind, system, run and units of the folder; empty values are omitted.

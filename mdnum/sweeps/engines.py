@@ -1,7 +1,7 @@
 """Execution of tasks by a `concurrent.futures.Executor`, by default in processes on all cores.
 
 An engine (executor) only starts worker processes. The folder of a sweep point shows whether the point was
-computed. A worker process that dies therefore loses only the point that it was computing.
+computed. A worker process that dies therefore loses only its current point.
 """
 
 from __future__ import annotations
@@ -47,9 +47,9 @@ _LOOK = 5.0
 
 @cache
 def _pinned(width: int) -> None:
-    """Restrict this process to reserved cores, because XLA uses all visible cores despite OMP_NUM_THREADS.
+    """Restrict this process to reserved cores. XLA uses all visible cores despite OMP_NUM_THREADS.
 
-    A core is reserved by a file lock, which is released when the process ends. Sweeps on the same machine
+    A file lock reserves a core. The lock is released when the process ends. Sweeps on the same machine
     therefore use different cores. If no core is free, two processes use the same core.
     """
     with suppress(ImportError, AttributeError, OSError):
@@ -74,7 +74,7 @@ def _pinned(width: int) -> None:
 def _answered(
     work: Callable[[Any], Any], task: Any, caller: tuple[str, int, str, bool], width: int
 ) -> tuple[Any, Exception | None]:
-    """Return a task's result or its exception, so that only errors of the engine itself are raised."""
+    """Return the result of a task, or the exception that the task raised."""
     host, pid, versions, allowed = caller
     if (socket.gethostname(), os.getpid()) != (host, pid):
         _pinned(width)
@@ -95,7 +95,7 @@ def _answered(
 
 
 class TaskEngine:
-    """An executor of tasks, which can be replaced when broken, and closed at the end."""
+    """An executor of tasks. A broken executor can be replaced."""
 
     def __init__(
         self, make: Callable[[], Executor], width: int, threads: int,
@@ -110,7 +110,7 @@ class TaskEngine:
         self.executor = make()
 
     def again(self) -> None:
-        """Replace the executor by a new executor if possible; tasks of the previous executor are lost."""
+        """Replace the executor by a new one if possible. Tasks of the previous executor are lost."""
         self.close()
         with suppress(Exception):
             self.executor = self.make()
@@ -122,7 +122,7 @@ class TaskEngine:
 
 
 def _local(workers: int | None) -> TaskEngine:
-    """Return an engine that starts local processes, which do not import the main script of the user."""
+    """Return an engine of local processes. They do not import the user's main script."""
     from loky import get_reusable_executor  # noqa: F401 (its pool starts processes by fork and exec)
     from loky.backend import resource_tracker
     from loky.backend.context import get_context
@@ -171,7 +171,7 @@ def _dask(address: str, workers: int | None) -> TaskEngine:
 
 
 def _executorlib(file: str, workers: int | None) -> TaskEngine:
-    """Return an executorlib engine; a TOML file gives its class (by default SLURM jobs) and keywords."""
+    """Return an executorlib engine. A TOML file gives its class (default: SLURM jobs) and keywords."""
     try:
         import executorlib  # pyright: ignore[reportMissingImports]
         from executorlib.api import ExecutorlibSocketError  # pyright: ignore[reportMissingImports]
@@ -226,7 +226,7 @@ def _executorlib(file: str, workers: int | None) -> TaskEngine:
 
 
 def _ends_with(parent: int) -> dict[str, Any]:
-    """Make this worker process end when its parent process ends, if both are on the same machine."""
+    """End this worker process when its parent process on the same machine ends."""
     if os.getppid() == parent:
         guard(parent)
     return {}
@@ -269,7 +269,7 @@ def computed(
     workers: int | None = None,
     lost: Callable[[Any, str], bool] = lambda task, why: True,
 ) -> Iterator[tuple[Any, Any]]:
-    """Run tasks in worker processes, and yield each task with its result when the task has finished.
+    """Run tasks in worker processes. Yield each task with its result when the task has finished.
 
     Args:
         work: function that processes a task, in another process.
@@ -341,7 +341,7 @@ def computed(
 
 @contextmanager
 def requested(on: str | Executor | None, workers: int | None) -> Iterator[TaskEngine | None]:
-    """Context manager that yields the requested engine, or None (this process) if none was requested."""
+    """Yield the requested engine, or None (this process) if none was requested."""
     if on is None and workers is None:
         yield None
         return
@@ -395,7 +395,7 @@ def _numbered(work: Callable[[Any], Any], task: tuple[int, Any]) -> Any:
 
 
 def _error(future: Future[Any]) -> BaseException | None:
-    """Return the exception of a finished future, or None if the future has a result."""
+    """Return the exception of a finished future, or None."""
     try:
         return future.exception()
     except CancelledError as cancelled:

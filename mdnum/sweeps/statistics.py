@@ -1,9 +1,9 @@
 """Means over random seeds, and differences between settings, each with its statistical error.
 
-The error of a run's mean is estimated from autocorrelation, and also from the scatter of means over random
-seeds. Errors from autocorrelation have many degrees of freedom, but are too small if a mode of the system
-relaxes in a longer time than the run. Errors from autocorrelation are therefore multiplied by one factor,
-which is determined from the scatter of means over all seeds and settings.
+The error of a run's mean is estimated from autocorrelation. It is also estimated from the scatter of means
+over random seeds. Errors from autocorrelation have many degrees of freedom. They are too small if a mode
+relaxes more slowly than the run lasts. They are therefore multiplied by one factor. The scatter of means over
+all seeds and settings determines this factor.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ Name = tuple[str, ...]
 
 @dataclass(frozen=True)
 class SeedMean:
-    """Mean of a measure over runs with different random seeds, with its standard error."""
+    """Mean of a measure over random seeds, with its standard error."""
 
     value: float
     error: float  # standard error; nan from a single run without one of its own, 0 of what does not vary
@@ -44,12 +44,12 @@ class SeedMean:
 
 
 def estimates(found: Mapping[K, Sequence[tuple[float, float, float]]]) -> dict[K, SeedMean]:
-    """Return the mean of one measure at each setting, over runs that differ only in their random seed.
+    """Return the mean of one measure over random seeds, at each setting.
 
-    The error of each mean is estimated from its runs, and then multiplied by a ratio: the observed scatter
-    between seeds, divided by the scatter expected from such errors. The ratio is the same for all settings of
-    a measure; more settings make it more precise. The scatter between the seeds of a single setting is used
-    instead if it has more degrees of freedom.
+    The error of each mean is estimated from its runs, and then multiplied by a ratio. The ratio is the
+    observed scatter between seeds, divided by the scatter expected from these errors. All settings of a
+    measure have the same ratio. More settings make it more precise. The scatter between the seeds of one
+    setting is used instead if it has more degrees of freedom.
 
     Args:
         found: (value, standard error, independent samples) of each run; nan if unknown.
@@ -76,7 +76,7 @@ def estimates(found: Mapping[K, Sequence[tuple[float, float, float]]]) -> dict[K
 
 
 class _Runs(NamedTuple):
-    """Variance of a mean over runs, from the errors of the runs and from their scatter, or nan if unknown."""
+    """Variance of a mean over runs, from their errors and from their scatter. It is nan if unknown."""
 
     runs: int
     within: float
@@ -103,7 +103,7 @@ class _Runs(NamedTuple):
 
 @dataclass(frozen=True)
 class Difference:
-    """Change of a measure due to another value of a choice, relative to the base value."""
+    """Change of a measure between the base value and another value of a choice."""
 
     value: float
     error: float  # of the difference
@@ -113,7 +113,7 @@ class Difference:
 
     @property
     def moves(self) -> bool | None:
-        """True if the choice changes the measure significantly, or None if the error is unknown."""
+        """True if the measure changes significantly. None if the error is unknown."""
         return None if np.isnan(self.chance) else bool(self.chance < ALPHA)
 
     @property
@@ -136,11 +136,11 @@ def difference(one: SeedMean, base: SeedMean) -> tuple[float, float, float]:
 def paired(
     raw: Mapping[K, tuple[float, float, float]], by_seed: Mapping[K, Float[np.ndarray, "seeds"]]
 ) -> dict[K, tuple[float, float, float]]:
-    """Return differences from a reference setting; correlated runs with the same seed are compared in pairs.
+    """Return differences from a reference setting. Correlated runs with the same seed are compared in pairs.
 
-    Runs at constant energy with the same initial velocities may remain correlated. For uncorrelated runs, the
-    scatter of few differences is a poor estimate of the error. Runs are therefore compared seed by seed only
-    if this significantly reduces the scatter of the differences, over all comparisons.
+    Runs at constant energy with the same initial velocities may remain correlated. Few differences of
+    uncorrelated runs give a poor estimate of the error. Runs are therefore compared in pairs only if this
+    clearly reduces the scatter of all differences.
 
     Args:
         raw: results of `difference` for each comparison of one measure. by_seed: the differences of each
@@ -165,7 +165,7 @@ def paired(
 
 
 def _quantile(chance: float, freedom: float) -> float:
-    """Return the value that Student's t exceeds with probability `chance`, given its degrees of freedom."""
+    """Return the value that Student's t exceeds with probability `chance`."""
     from scipy.special import stdtrit
 
     # scipy.stats has the same, and takes a hundred times as long
@@ -175,7 +175,7 @@ def _quantile(chance: float, freedom: float) -> float:
 def corrected(raw: Mapping[Name, tuple[float, float, float]]) -> dict[Name, Difference]:
     """Add p-values, corrected for multiple comparisons (Holm 1979), to differences with known errors.
 
-    A difference with unknown degrees of freedom (nan) gets no p-value, and does not count as a comparison.
+    A difference with unknown degrees of freedom (nan) gets no p-value. It does not count as a comparison.
     """
     from scipy.special import stdtr
 
@@ -199,7 +199,7 @@ def corrected(raw: Mapping[Name, tuple[float, float, float]]) -> dict[Name, Diff
 
 
 def effects(places: Float[np.ndarray, "points axes"], values: Float[np.ndarray, "points"]) -> list[Any]:
-    """Return the change of a measure from the first to the last value of each varied choice, by a linear fit.
+    """Return the change of a measure over the range of each varied choice, by a linear fit.
 
     Args:
         places: position of each point along each axis, from 0 to 1.

@@ -1,4 +1,4 @@
-"""Report page of a ball's run: heights, solver, margins, derivatives, contacts and stop decisions."""
+"""Report page of a ball's run."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ class BallView(View):
 
     @property
     def exact(self) -> Mapping[str, Any]:
-        """Quantities of the run that are known in closed form; empty if there are none."""
+        """Quantities of the run that are known in closed form."""
         return self.summary["exact"] or {}
 
     @property
@@ -42,12 +42,12 @@ class BallView(View):
 
     @property
     def ended(self) -> dict[str, int]:
-        """Number of times that the solver stopped, by reason (tolerance reached, cap reached, ...)."""
+        """Number of times that the solver stopped, by reason."""
         return {word: n for word, n in self.summary["ended"].items() if n and word != "none"}
 
     @property
     def located(self) -> bool:
-        """True if impact times are computed within a step; the solver then counts impacts, not iterations."""
+        """True if impact times are computed within a step. The solver then counts impacts, not iterations."""
         return self.summary["integrator"] == "event-located"
 
     def first_step(self, reason: str) -> int:
@@ -61,7 +61,7 @@ class BallView(View):
 
     @cached_property
     def ratio(self) -> np.ndarray:
-        """Absolute margin of each contact flip, divided by the bound on its rounding error."""
+        """Margin of each contact flip, divided by its rounding bound."""
         return margins_in_bounds(self.table("contacts"))
 
 
@@ -70,7 +70,7 @@ def decision(variant: Mapping[str, Any]) -> str:
 
 
 def page(view: BallView, verdict: Verdict) -> Page:
-    """Return the report page of a ball's run, with a section for each subject that has data."""
+    """Return the report page of a ball's run."""
     summary = view.summary
     about = TEXTS(
         "about", balls=summary["balls"], steps=summary["steps"], contact=summary["contact_kind"],
@@ -99,7 +99,7 @@ def page(view: BallView, verdict: Verdict) -> Page:
 
 
 def _groups(x: np.ndarray, y: np.ndarray, *groups: tuple[np.ndarray, str, Role]) -> tuple[Series, ...]:
-    """Split points (x, y) into groups; return a data series for each group that has a finite y."""
+    """Split points (x, y) into groups. Return a data series for each group with a finite y."""
     return tuple(
         Series(label, x[mine], y[mine], "points", role)
         for mine, label, role in groups
@@ -146,7 +146,7 @@ def _nearest(view: BallView) -> Iterator[Plot]:
 
 
 def _ranges(view: BallView) -> Iterator[Any]:
-    """Yield a table: range of each quantity, and the first step at which narrower formats cannot hold it."""
+    """Yield a table of ranges. It names the first step at which narrower formats cannot hold a quantity."""
     table = range_table(lambda name: TEXTS(f"range_{name}"), view.table("steps"))
     if table.rows:
         yield table
@@ -291,7 +291,7 @@ def _variants(view: BallView) -> Iterator[Any]:
 
 
 def _contacts(view: BallView) -> Iterator[Any]:
-    """Yield a table, ordered by step, of the contact flips that rounding errors could change most easily."""
+    """Yield a table of the contact flips that rounding could change most easily."""
     rows, ratio = view.table("contacts"), view.ratio
     if not len(ratio):
         yield TEXTS("no_contacts")
@@ -303,7 +303,7 @@ def _contacts(view: BallView) -> Iterator[Any]:
 
 
 def _stop_decisions(view: BallView) -> Iterator[Any]:
-    """Yield a table, ordered by step, of the solver's stop decisions closest to the stopping threshold."""
+    """Yield a table of the solver's stop decisions closest to the threshold."""
     rows = view.table("solver")
     if not len(rows["step"]):
         return

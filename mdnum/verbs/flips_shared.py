@@ -1,4 +1,4 @@
-"""Functions shared by `mdnum flips` of one trajectory and of two: summary entries and number formats."""
+"""Functions shared by `mdnum flips` of one and of two trajectories."""
 
 from __future__ import annotations
 
@@ -40,13 +40,13 @@ def selected(trajectory: Trajectory, between: tuple[str, str] | None) -> Groups:
 
 
 def stem(trajectory: Trajectory) -> str:
-    """Return the first part of an output folder's default name: the name of the trajectory or of its run."""
+    """Return the first part of the default name of an output folder."""
     name = trajectory.path.name.split(".")[0]
     return trajectory.path.resolve().parent.name if name == "trajectory" else name
 
 
 def name_of(trajectory: Trajectory) -> str:
-    """Return the name of a trajectory for a page: the file name, or the name of the mdnum run's folder."""
+    """Return the name of a trajectory for a page: the file, or the folder of the mdnum run."""
     own = trajectory.path.name == "trajectory.traj"
     name = trajectory.path.resolve().parent.name if own else trajectory.path.name
     return f"{name}@{trajectory.slice_words}" if trajectory.slice_words else name
@@ -76,7 +76,7 @@ def in_python(text: str) -> str:
 
 @contextmanager
 def as_python(in_memory: bool) -> Iterator[None]:
-    """In error messages, replace command-line options by Python arguments if frames were given as arrays."""
+    """In error messages, replace command-line options by Python arguments."""
     try:
         yield
     except InputError as error:
@@ -86,7 +86,7 @@ def as_python(in_memory: bool) -> Iterator[None]:
 
 
 def ending(stopped: InputError | None, interrupted: bool, in_memory: bool = False) -> dict[str, Any]:
-    """Return summary entries: whether all frames were read, and the error if reading stopped early."""
+    """Return summary entries: whether all frames were read, and the error otherwise."""
     told = None if stopped is None else str(stopped)
     return {
         "stopped": in_python(told) if told and in_memory else told,
@@ -96,7 +96,7 @@ def ending(stopped: InputError | None, interrupted: bool, in_memory: bool = Fals
 
 
 class HeldRows:
-    """Buffer of table rows, which are written to the output folder for many frames together."""
+    """Buffer of table rows. The rows of many frames are written together."""
 
     def __init__(self, trajectory: Trajectory) -> None:
         units = {"length": trajectory.length, "decision": trajectory.length, "time": trajectory.time}
@@ -114,7 +114,7 @@ class HeldRows:
         self.flips += rows * (table == "flips")
 
     def drain(self, folder: RunFolder, passes: Iterator[Any], found: Any, of: int, log: Progress) -> bool:
-        """Read frames until the end or until control-C is pressed; return whether control-C was pressed.
+        """Read frames until the end or until control-C. Return whether control-C was pressed.
 
         Args:
             passes: iterator with one item per frame, which adds rows.
@@ -146,7 +146,7 @@ class HeldRows:
 
 
 class FlipsView(View):
-    """Read access to a folder of flips; formats frames as times, and lengths with units."""
+    """Read access to a folder of flips. It formats times and lengths with their units."""
 
     @property
     def timed(self) -> bool:
@@ -174,12 +174,12 @@ class FlipsView(View):
         return " and ".join(f"“{one}”" for one in self.summary["between"] or ()) or None
 
     def time(self, text: str) -> str:
-        """Append the unit of time to a number; only the unit "step" has a plural."""
+        """Append the unit of time to a number."""
         unit = self.summary["time"]
         return f"{text} {unit}{'s' if unit == 'step' and text not in ('1', '1.00', '1.0') else ''}"
 
     def duration(self, frames: float | None, digits: int = 3, beyond: str = "longer than seen") -> str:
-        """Format a number of frames as a duration: a time if the frames have times."""
+        """Format a number of frames as a time, if the frames have times."""
         if frames is None:
             return beyond
         if self.timed:
@@ -187,10 +187,10 @@ class FlipsView(View):
         return f"{plain(frames, digits)} frame{'' if frames == 1 else 's'}"
 
     def life(self, one: Mapping[str, Any], name: str = "median", of: str = "lifetime") -> str:
-        """Format a contact lifetime: a value, a bound, or the reason why the lifetime is unknown.
+        """Format a contact lifetime: a value, a bound, or why it is unknown.
 
-        If the median lifetime is one frame, all lifetimes are upper bounds, because pairs crossed the cutoff
-        several times between frames.
+        A median lifetime of one frame is only an upper bound. Pairs then crossed the cutoff several times
+        between frames.
         """
         life = one[of]
         if not one["pairs_most"]:
@@ -204,7 +204,7 @@ class FlipsView(View):
         return bound * (life[name] is not None) + self.duration(life[name])
 
     def rate(self, per_frame: float | None) -> str:
-        """Format a rate per frame or, if frames have times, per time; format None as a dash."""
+        """Format a rate per time, or per frame if frames have no times. None becomes a dash."""
         if per_frame is None:
             return "–"
         if self.timed:
@@ -216,7 +216,7 @@ class FlipsView(View):
         return f"{number(value)} {self.unit}".rstrip()
 
     def rule(self, one: Mapping[str, Any]) -> str:
-        """Format a neighbor rule with its unit of length, such as "r < 8.5 Å"."""
+        """Format a neighbor rule, such as "r < 8.5 Å"."""
         name = one["rule"]
         return f"{name} {self.unit}" if self.unit and "<" in name and "most" not in name else name
 
@@ -235,7 +235,7 @@ class FlipsView(View):
         return f"{text}, repeating along {listed(axes)}"
 
     def repeated(self, repeats: Mapping[str, Any] | None, file: str = "") -> Iterator[Finding]:
-        """Yield findings on frames that repeat earlier frames; `file` is the file's name in a comparison."""
+        """Yield findings on frames that repeat earlier frames."""
         again = repeats.get("again", ()) if repeats else ()
         if again and repeats and repeats["dropped"]:
             total = sum(one["frames"] for one in again)
@@ -256,20 +256,20 @@ class FlipsView(View):
         yield TEXTS.finding("REPEATED_FRAMES", *variants, ranges=listed(told), **values)
 
     def again(self, again: Sequence[Mapping[str, Any]]) -> list[str]:
-        """Return a phrase for each stretch of frames whose times repeat the times of earlier frames."""
+        """Return a phrase for each group of frames whose times repeat earlier times."""
         kinds = ["one" if one["first"] == one["last"] else "many" for one in again[:_RANGES]]
         times = [{"time": plain(one["time"], 9), "to": self.time(plain(one["to"], 9))} for one in again]
         return [TEXTS(f"again_{kind}", **{**again[k], **times[k]}) for k, kind in enumerate(kinds)]
 
     def axis(self, rows: Mapping[str, np.ndarray]) -> tuple[str, np.ndarray]:
-        """Return the label and the values of an axis along the trajectory: times or frame numbers."""
+        """Return the label and the values of an axis: times or frame numbers."""
         if self.timed:
             return f"time ({self.summary['time']})", rows["time"]
         return "frame", rows["frame"]
 
 
 def average(mean: float) -> str:
-    """Format the mean of a count: four significant digits, or the nearest integer for 1000 and more."""
+    """Format the mean of a count: four significant digits, or an integer from 1000."""
     return count(round(mean)) if mean >= 1000 else number(mean, 4)
 
 
@@ -279,7 +279,7 @@ def repeating(box: Mapping[str, Any]) -> list[str]:
 
 
 def resolution(kept: Mapping[str, Any], length: str) -> str:
-    """Return a phrase on the resolution (rounding) of the positions in a trajectory file."""
+    """Return a phrase on the rounding of positions in a trajectory file."""
     code = kept["kind"]
     if not kept["told"]:
         code = "usual" if kept["step"] else "unknown"

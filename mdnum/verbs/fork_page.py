@@ -1,4 +1,4 @@
-"""Report page of two runs that differ in one numerical choice, made from the output folder alone."""
+"""Report page of two runs that differ in one numerical choice."""
 
 from __future__ import annotations
 
@@ -84,7 +84,7 @@ def _has(table: Mapping[str, np.ndarray], name: str) -> bool:
 
 
 def _separation(view: View) -> Iterator[Plot | str]:
-    """Yield figures of the distance between runs A and B, where B uses its own decisions or those of A."""
+    """Yield figures of the distance between runs A and B. B uses its own decisions or those of A."""
     s, table = view.summary, view.table("separation")
     if not _has(table, "free"):
         return
@@ -125,7 +125,7 @@ def _separation(view: View) -> Iterator[Plot | str]:
 
 
 def _decision(view: View) -> Iterator[Any]:
-    """Yield a table with details of the first decision that differs between the two runs."""
+    """Yield a table of the first decision that differs between the two runs."""
     s, unit = view.summary, view.units.length
     d = s["decision"]
     if d is None:
@@ -159,7 +159,7 @@ def _decision(view: View) -> Iterator[Any]:
 
 
 def _around(view: View) -> Iterator[Any]:
-    """Yield a figure of the first differing decision: atoms around the pair, or heights of the ball."""
+    """Yield a figure of the first differing decision."""
     d = view.summary["decision"]
     if d is None:
         return
@@ -183,7 +183,7 @@ def _around(view: View) -> Iterator[Any]:
 
 
 def _atoms(view: View, figure: Canvas) -> None:
-    """Draw the atoms of runs A and B in two panels, with the pair in the plane and the cutoff as a circle."""
+    """Draw the atoms of runs A and B in two panels. The pair lies in the plane; a circle shows the cutoff."""
     d, table = view.summary["decision"], view.table("neighborhood")
     x, moved = (
         np.stack([table[k] for k in names], axis=1) for names in (("x", "y", "z"), ("dx", "dy", "dz"))
@@ -222,7 +222,7 @@ def _atoms(view: View, figure: Canvas) -> None:
 
 
 def _two_by_two(view: View) -> Iterator[Any]:
-    """Yield a table of the steps at which runs with the arithmetic and decisions of run A or B diverge."""
+    """Yield a table of when runs diverge, with the arithmetic and the decisions of run A or B."""
     s, unit = view.summary, view.units.length
     lines: dict[tuple[str, str], dict[str, str]] = {}
     for cell in s["table"]:
@@ -297,7 +297,7 @@ def _minimal(s: Mapping[str, Any]) -> Iterator[Any]:
 
 
 def _certain(view: View) -> Iterator[Any]:
-    """Yield tables and a figure of the steps up to which rounding cannot have changed any decision."""
+    """Yield tables of the steps up to which rounding cannot have changed any decision."""
     s, rows = view.summary, []
     for name, step in (s.get("certified_horizon") or {}).items():
         ambiguous, first = s["ambiguous"][name], s["ambiguous_first"][name]
@@ -356,7 +356,7 @@ def _growth(view: View) -> Iterator[Any]:
 
 
 def _after(view: View) -> Iterator[Plot]:
-    """Yield figures of numbers of different and overridden decisions, and of energy differences from A."""
+    """Yield figures of different decisions, overridden decisions and energy differences from run A."""
     s, table = view.summary, view.table("separation")
     step, dates, length = table["step"], _dates(s, "fork", "split"), view.units.length
     named = [("cross", "decisions that differ"), ("overridden", "decisions overridden")]
@@ -422,7 +422,7 @@ def _what(view: View) -> Iterator[Any]:
 
 
 def differences(rows: Sequence[Sequence[Any]], title: str = "") -> Table:
-    """Return a table of the settings that differ between two runs: key, value in A, value in B."""
+    """Return a table of the settings that differ between two runs."""
     return Table(("key", "in A", "in B"), [(key, _value(a), _value(b)) for key, a, b in rows], title)
 
 
