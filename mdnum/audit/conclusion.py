@@ -1,4 +1,4 @@
-"""Conclusion of all calculator checks: is it safe to run and to differentiate the calculator?"""
+"""Conclusion of an audit: is it safe to run and to differentiate the calculator?"""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ def needed_to(question: str) -> set[str]:
 
 
 def answers(results: Sequence[CheckResult], wanted: Sequence[str]) -> Mapping[str, Answer]:
-    """Answer, from the results of the checks, whether it is safe to run and to differentiate a calculator."""
+    """Answer whether it is safe to run and to differentiate a calculator."""
     return {question: _answer(question, results, wanted) for question in _QUESTIONS}
 
 
@@ -45,12 +45,12 @@ def _answer(question: str, results: Sequence[CheckResult], wanted: Sequence[str]
 
 
 def largely_unasked(result: CheckResult) -> bool:
-    """Return whether a check reached its time limit before it had examined most of its test cases."""
+    """Return whether a check ran out of time before most of its cases."""
     return result.asked < _NEARLY * result.possible
 
 
 def nothing_felt(results: Sequence[CheckResult]) -> bool:
-    """Return whether no atoms of the structure interact, so that the results of the audit are meaningless."""
+    """Return whether no atoms interact. The audit is then meaningless."""
     return any(result.numbers.get("nothing_felt") for result in results)
 
 
@@ -59,16 +59,16 @@ def _begun(results: Sequence[CheckResult]) -> set[str]:
 
 
 def to_come(results: Sequence[CheckResult], wanted: Sequence[str]) -> bool:
-    """Return whether the audit has no verdict yet: no error was found, and a basic check has not run."""
+    """Return whether the verdict is open: no error yet, and a basic check has not run."""
     begun, basic = _begun(results), {name for name in wanted if CHECKS[name].basic}
     return "no" not in answers(results, wanted).values() and not (basic <= begun and begun)
 
 
 def concluded(results: Sequence[CheckResult]) -> dict[str, str]:
-    """Return which text applies to each finding that depends on the results of more than one check.
+    """Return the text of each finding that depends on several checks.
 
-    Incorrect forces that do no work around closed loops are the gradient of another energy. Forces that do
-    work around closed loops are not the gradient of any energy.
+    Incorrect forces without work around closed loops are the gradient of another energy. Forces with work
+    around closed loops are not the gradient of any energy.
     """
     numbers = {result.name: result.numbers for result in results if not largely_unasked(result)}
     curl, forces = numbers.get("curl"), numbers.get("forces")

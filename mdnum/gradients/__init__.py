@@ -1,7 +1,7 @@
-"""Gradients of long simulations, and the number of steps up to which each gradient can be trusted.
+"""Gradients of long simulations, and how far they can be trusted.
 
-A simulation is differentiated at its recorded states and decisions; changes of decisions (flips) contribute a
-separate term. Gradient methods are subclasses of `Method`, and losses are subclasses of `Loss`.
+A simulation is differentiated at its recorded decisions. Flips contribute a separate term. Gradient methods
+are subclasses of `Method`, and losses are subclasses of `Loss`.
 """
 
 from mdnum.gradients.differentiate import differentiable, value_and_grad

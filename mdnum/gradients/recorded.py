@@ -1,7 +1,7 @@
-"""Gradient methods that linearize a recorded run, in reverse mode (cotangents) or forward mode (tangents).
+"""Gradient methods that linearize a recorded run.
 
 First, an ordinary run is made and recorded. The steps are then linearized at the recorded states and
-decisions. For a reversible run in fixed-point numbers, the states are not stored but recomputed.
+decisions. A reversible run in fixed-point numbers is recomputed instead of stored.
 """
 
 from __future__ import annotations
@@ -54,7 +54,7 @@ Watch = Callable[[TapeStretch, AdjointCarry], None]
 
 @dataclass(frozen=True)
 class ReversePass:
-    """Result of a reverse pass: the recorded run, the gradient, and the crossings of the cutoff."""
+    """Recorded run, gradient and cutoff crossings of a reverse pass."""
 
     tape: RunTape  # the run
     parts: Cotangents  # derivatives by all that it is made of
@@ -75,7 +75,7 @@ def passed(
     tape: RunTape | None = None,
     progress: Progress | None = None,
 ) -> ReversePass:
-    """Run a simulation and its reverse pass; callbacks receive the cotangents of groups of time steps.
+    """Run a simulation and its reverse pass. `watches` receive the cotangents.
 
     Args:
         names: full names of the parameters. saltation: whether to include the contribution of flips.
@@ -120,7 +120,7 @@ def tape_of(problem: Problem, flips: bool, budget: int = KEPT, progress: Progres
 
 @dataclass(frozen=True)
 class Symmetric(Method):
-    """Gradient method: derivative of the loss at fixed decisions, from one low-memory reverse pass."""
+    """Gradient method: derivative at fixed decisions, with little memory."""
 
     # bytes of the recorded run that are kept in memory; what does not fit is run again, stretch by stretch,
     # with the same bits
@@ -147,7 +147,7 @@ class Symmetric(Method):
 
 @dataclass(frozen=True)
 class EventAware(Method):
-    """Gradient method: derivative at fixed decisions, plus contributions from changes of all flip times."""
+    """Gradient method: derivative at fixed decisions, plus the effect of flip times."""
 
     # radial speed below which a crossing grazes and is left out, as a share of the rms radial speed of a
     # pair. Left in, single crossings would dominate: their terms go with one over that speed
@@ -231,7 +231,7 @@ class Forward(Method):
 
 @dataclass(frozen=True)
 class Reversible(Method):
-    """Gradient method: derivative at fixed decisions; a fixed-point run is reversed in time, not stored.
+    """Gradient method: derivative at fixed decisions. The run is reversed in time, not stored.
 
     The forward pass stores only the last state. Rounding to integers is differentiated as the identity.
 
@@ -267,7 +267,7 @@ class Reversible(Method):
 
 @dataclass(frozen=True)
 class Surrogate(Method):
-    """Gradient method: derivative of another program, with a switching function so that no force jumps."""
+    """Gradient method: derivative with a switching function at the cutoff."""
 
     cutoff: str = "quintic"  # of the twin; one with an onset
     onset: float = ONSET_FRACTION  # where its switching begins, as a share of the cutoff
@@ -285,7 +285,7 @@ class Surrogate(Method):
         return self.method.reason_unavailable(self.twin(problem), names)
 
     def twin(self, problem: Problem) -> Problem:
-        """Return the problem with a switching function at the cutoff, which is differentiated instead."""
+        """Return the problem with a switching function at the cutoff."""
         made = problem.simulation.with_cutoff(self.cutoff)
         onset = parameters.value(made, "cutoff.radius") * self.onset
         return replace(problem, simulation=made).at({"cutoff.onset": onset})
@@ -298,7 +298,7 @@ class Surrogate(Method):
 
 
 def weights(crossings: Sequence[Crossings]) -> dict[str, Any]:
-    """Return the numbers of all crossings and of grazing ones, and the crossings with the largest weights."""
+    """Return the numbers of all and of grazing crossings, and the crossings with the largest weights."""
     speed, weight, grazing = (joined(crossings, name) for name in ("speed", "weight", "grazing"))
     flips = {name: joined(crossings, name, ledger=True) for name in ("step", "i", "j", "entered")}
     key, heavy = -np.abs(weight), np.arange(len(weight))
@@ -320,18 +320,18 @@ def weights(crossings: Sequence[Crossings]) -> dict[str, Any]:
 
 
 def joined(crossings: Sequence[Crossings], name: str, *, ledger: bool = False) -> np.ndarray:
-    """Concatenate one column of all cutoff crossings (or of their flips) from several stretches of steps."""
+    """Concatenate one column of the crossings from several stretches."""
     return np.concatenate([getattr(one.ledger if ledger else one, name) for one in crossings])
 
 
 def radial_speed(simulation: Simulation) -> float:
-    """Return the root mean square radial speed (length per internal time) of a pair of atoms."""
+    """Return the rms radial speed of a pair, in length per internal time."""
     speed2 = float(np.mean(np.sum(simulation.velocities**2, axis=1)))
     return float(np.sqrt(2 * speed2 / 3))
 
 
 def wanted(names: Sequence[str]) -> frozenset[str]:
-    """Return the kinds of derivatives that a reverse pass must compute for the named parameters."""
+    """Return which derivatives a reverse pass must compute."""
     parts = {name: {MODEL} for name in ("potential", "cutoff", "terms")}
     parts |= {"dynamics": {FORCE}, "box": {SCALE}}
     return frozenset(

@@ -1,7 +1,7 @@
 """Load a Python object named by `package.module:thing(argument=value)` or `file.py:thing(argument=value)`.
 
-A module is imported or a file is executed, and the object is looked up by name. If arguments are given, the
-object is called. Arguments must be literals; nothing else is evaluated.
+The module is imported, or the file is executed. If arguments are given, the object is called. Arguments must
+be literals; nothing else is evaluated.
 """
 
 from __future__ import annotations
@@ -33,12 +33,12 @@ class NamedObject:
 
     @property
     def is_file(self) -> bool:
-        """True if `home` is the path of a Python file, and not the name of a module."""
+        """True if `home` is the path of a Python file."""
         return self.home.endswith(".py")
 
     @property
     def name(self) -> str:
-        """Last part of the dotted name, without arguments; the file's stem if no name is given."""
+        """Last part of the dotted name, or the file's stem."""
         return self.call.partition("(")[0].rpartition(".")[2].strip() or Path(self.home).stem
 
     def find(self, defaults: Sequence[str] = (), anew: bool = False) -> Any:
@@ -77,7 +77,7 @@ class NamedObject:
             ) from error
 
     def source(self) -> tuple[str, str]:
-        """Return import statements and an expression that create the object in a script without mdnum."""
+        """Return Python code that creates the object without mdnum."""
         first = self.call.partition("(")[0].partition(".")[0].strip()
         if not self.is_file:
             return f"from {self.home} import {first}\n", self.call
@@ -152,7 +152,7 @@ class NamedObject:
 
 
 def place(text: str) -> NamedObject | None:
-    """Parse the location of an object; return None if the text contains neither a file nor `module:`."""
+    """Parse the location of an object. Return None if the text has no file or `module:`."""
     text = text.strip()
     head, separator, call = text.partition(".py:")
     if separator:
@@ -164,6 +164,6 @@ def place(text: str) -> NamedObject | None:
 
 
 def public(scope: Any) -> list[str]:
-    """Return the names of the public functions and other callables of a module or a class."""
+    """Return the names of the public callables of a module or a class."""
     scope = scope if isinstance(scope, ModuleType | type) else type(scope)
     return [name for name in vars(scope) if name[0] != "_" and callable(getattr(scope, name, None))]

@@ -1,4 +1,4 @@
-"""Compare neighbor searches with an exact search, and find their effective cutoffs (`mdnum check pairs`)."""
+"""Compare neighbor searches with an exact search (`mdnum check pairs`)."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ _NEARBY = 3  # ulps either side of r_cut in which oriented pairs are placed
 
 @dataclass(frozen=True)
 class Search:
-    """A neighbor list that is called with positions and cell in the form that it requires."""
+    """Neighbor search of mdnum or of a library, to be tested."""
 
     listed: PairList
 
@@ -43,7 +43,7 @@ class Search:
 
     @property
     def ours(self) -> bool:
-        """True if mdnum uses the neighbor search, so that decisions of a run depend on this search."""
+        """True if mdnum uses the neighbor search for its runs."""
         return self.listed.package == "mdnum"
 
     @property
@@ -57,7 +57,7 @@ class Search:
 
     @cached_property
     def _full(self) -> bool:
-        """True if the neighbor search lists every pair twice, once for each of its two atoms."""
+        """True if the neighbor search lists every pair twice."""
         if self.listed.full is not None:
             return self.listed.full
         pair, cell, pbc = np.array([[0.0, 0, 0], [0.5, 0, 0]]), 4.0 * np.eye(3), np.ones(3, bool)
@@ -66,14 +66,14 @@ class Search:
         return len(read(self._call(pair, cell, pbc, 1.0))) > 1
 
     def refusal(self, positions: ndarray, cell: ndarray, pbc: ndarray, r_cut: float) -> str | None:
-        """Return the reason why the neighbor search does not support a structure; None if it does."""
+        """Return why the search does not support a structure. None if it does."""
         if self.listed.version is None:
             return "not installed"
         positions, cell = self._placed(positions, cell, pbc)
         return self.listed.limits.refusal(once("", "few", positions, cell, pbc.tolist(), r_cut))
 
     def pairs(self, positions: ndarray, cell: ndarray, pbc: ndarray, r_cut: float) -> tuple[ndarray, ndarray]:
-        """Return atom indices i <= j of the pairs within r_cut, with one entry for each periodic image."""
+        """Return the pairs i <= j within r_cut, one entry per periodic image."""
         positions, cell = self._placed(np.asarray(positions, float), np.asarray(cell, float), pbc)
         answer = read(self._call(positions, cell, np.array(pbc), float(r_cut)))
         i, j = np.minimum(answer.i, answer.j), np.maximum(answer.i, answer.j)
@@ -84,7 +84,7 @@ class Search:
         return i, j
 
     def _placed(self, positions: ndarray, cell: ndarray, pbc: ndarray) -> tuple[ndarray, ndarray]:
-        """Return positions and cell in the form that the neighbor list requires, with the same distances."""
+        """Return positions and cell in the form that the neighbor search requires."""
         limits = self.listed.limits
         positions, cell = np.array(positions), np.where(np.asarray(pbc)[:, None], cell, 0.0)
         if limits.whole_cell and pbc.any():
@@ -108,7 +108,7 @@ class Search:
 
 
 def all_searches(system: Simulation) -> tuple[Search, ...]:
-    """Return all neighbor searches: those of libraries, and those of mdnum set up for a system."""
+    """Return all neighbor searches of libraries and of mdnum."""
     own = own_searches(system)
     return (*own, *(Search(one) for one in known() if not one.kept and one.package != "mdnum"))
 
@@ -116,8 +116,8 @@ def all_searches(system: Simulation) -> tuple[Search, ...]:
 def own_searches(system: Simulation) -> tuple[Search, ...]:
     """Return the neighbor searches of mdnum, set up for a system.
 
-    The search "mdnum force loop" selects pairs like the force evaluation, but without jit. The searches
-    "mdnum, host list" and "mdnum, jax-md list" use mdnum's two list builders, and decide in the same way.
+    The search "mdnum force loop" selects pairs as the force evaluation does. The searches "mdnum, host list"
+    and "mdnum, jax-md list" use mdnum's two list builders.
     """
     compare, dtype = system.decider.compare, system.policy.decision
     unit = _SINGLE if "float32" in (dtype, system.policy.state) else 2.0**-53
@@ -205,7 +205,7 @@ class SearchResult:
 
 @dataclass(frozen=True)
 class PairsReport:
-    """Comparison of the pairs that neighbor searches find with those that brute force finds."""
+    """Comparison of neighbor searches with brute force."""
 
     system: str  # name
     compare: str  # what inside means in this system
@@ -241,11 +241,11 @@ def check_pairs(
     searches: Sequence[Search] | None = None,
     effective: bool = True,
 ) -> PairsReport:
-    """Find the pairs inside the cutoff with every neighbor search, and compare them with brute force.
+    """Compare the pairs of every neighbor search with those of brute force.
 
-    Each neighbor search is run once for each cutoff radius of the species pairs. Brute force uses the
-    comparison (< or <=) of the system file, in rational arithmetic near the cutoff. The result "differs at
-    the cutoff" means that only decisions near the cutoff differ, by rounding or convention.
+    Each search is run once per cutoff radius. Brute force uses the comparison (< or <=) of the system file.
+    Near the cutoff, its arithmetic is exact. "differs at the cutoff" means that only decisions near the
+    cutoff differ.
 
     Args:
         subject: a `Simulation`, or any argument of `mdnum.build`.
@@ -300,7 +300,7 @@ def check_pairs(
 
 
 def compare_pairs(i: ndarray, j: ndarray, right: PairSet, r_cut: float, bound: float) -> tuple[int, int, int]:
-    """Return the numbers of missing, extra and borderline pairs in comparison with brute force.
+    """Return the numbers of missing, extra and borderline pairs.
 
     Args:
         i, j: pairs from the neighbor search, i <= j, one row per periodic image.
@@ -324,7 +324,7 @@ def compare_pairs(i: ndarray, j: ndarray, right: PairSet, r_cut: float, bound: f
 
 @dataclass(frozen=True)
 class EffectiveCutoff:
-    """The cutoff that a neighbor search actually applies if a cutoff r_cut is requested."""
+    """The cutoff that a neighbor search applies when r_cut is requested."""
 
     r_cut: float  # the cutoff asked for
     last_counted: float  # largest distance along x at which the pair is still counted
@@ -344,10 +344,10 @@ class EffectiveCutoff:
 def effective_cutoff(
     search: Search, r_cut: float, *, periodic: bool = True, oriented: int | None = None
 ) -> EffectiveCutoff:
-    """Find the largest distance (double) of two atoms that a neighbor search counts as inside r_cut.
+    """Find the largest distance that a neighbor search counts as inside r_cut.
 
-    The two atoms differ only in x, and the first has x = 0: their distance is exactly the x coordinate of the
-    second atom. In a periodic box (5 r_cut wide), the result also depends on how the search wraps atoms.
+    The first atom is at x = 0, so the distance is the x coordinate of the second. In a periodic box (5 r_cut
+    wide), the result also depends on the wrapping of atoms.
 
     Args:
         periodic: use a periodic box, as in a simulation; otherwise atoms without a box.
@@ -387,7 +387,7 @@ def effective_cutoff(
 
 
 def borderline_pairs(r_cut: float, count: int) -> ndarray:
-    """Return positions of random pairs of atoms, shape (count, 2, 3), at distances within 3 ulps of r_cut."""
+    """Return positions of random pairs within 3 ulps of r_cut, shape (count, 2, 3)."""
     rng = np.random.default_rng(0)
     direction = rng.normal(size=(count, 3))
     direction /= np.linalg.norm(direction, axis=1)[:, None]

@@ -1,4 +1,4 @@
-"""Statistics of a run's flips (reversals, residence times, busiest pairs, margins), and of its energies."""
+"""Statistics of the flips and the energies of a run."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ _LEAST_ROWS, _BLOCKS = 40, 10
 
 @dataclass(frozen=True)
 class Stays:
-    """Residence times of pairs of atoms inside and outside the cutoff: numbers of steps between flips."""
+    """Residence times of pairs inside and outside the cutoff, in steps."""
 
     inside: Int[np.ndarray, "lengths"]  # from entering to leaving: how many stays last 0, 1, 2, ... steps
     outside: Int[np.ndarray, "lengths"]  # from leaving to entering again, likewise
@@ -34,12 +34,12 @@ class Stays:
         return int(self.inside.sum() + self.outside.sum())
 
     def undone_within(self, steps: int) -> int:
-        """Return the number of flips followed by the opposite flip of the pair within `steps` steps."""
+        """Return the number of flips that are reversed within `steps` steps."""
         return int(self.inside[: steps + 1].sum() + self.outside[: steps + 1].sum())
 
 
 def median(counts: Int[np.ndarray, "lengths"]) -> float | None:
-    """Return the median residence time from a histogram of residence times (0, 1, 2, ... steps), or None."""
+    """Return the median of a histogram of residence times (0, 1, 2, ... steps), or None."""
     total = int(counts.sum())
     if not total:
         return None
@@ -58,16 +58,15 @@ class PairCounts:
     terms: np.ndarray  # names of the terms whose decisions they are; "" where there are none
 
     def rows(self, most: int) -> list[dict[str, Any]]:
-        """Return the pairs with the most flips, and their numbers of flips, as plain values."""
+        """Return the pairs with the most flips, as plain values."""
         columns = {name: values[:most].tolist() for name, values in vars(self).items()}
         return [dict(zip(columns, row, strict=True)) for row in zip(*columns.values(), strict=True)]
 
 
 class Scan:
-    """Statistics of a table of flips that may be larger than memory, read block by block.
+    """Statistics of a table of flips. The table is read in blocks and may exceed the memory.
 
-    A scan of the table keeps a row for each pair of atoms, counts by step and by residence time, the margin
-    of every flip, and the flips nearest to their threshold.
+    The statistics contain the margin of every flip, and counts by pair, step and residence time.
 
     Args:
         steps: number of steps in the run's series; flips happen at the steps 0 to steps - 1.
@@ -126,7 +125,7 @@ class Scan:
 
     @property
     def alternates(self) -> bool:
-        """True if each pair alternately enters and leaves the cutoff; False shows that a flip is missing."""
+        """True if each pair enters and leaves the cutoff in turn. False if a flip is missing."""
         self._follow()
         return self._alternates
 
@@ -140,8 +139,8 @@ class Scan:
     def stays(self) -> Stays:
         """Residence times of pairs inside and outside the cutoff.
 
-        Stays inside or outside the cutoff before the first or after the last flip of a pair are incomplete
-        and not counted. Long stays are therefore underrepresented in short runs.
+        The first and the last stay of each pair are incomplete and not counted. Long stays are therefore
+        underrepresented in short runs.
         """
         self._follow()
         return Stays(inside=self._lengths[1], outside=self._lengths[0])
@@ -164,7 +163,7 @@ class Scan:
         )
 
     def matches(self, series: Mapping[str, np.ndarray]) -> Bool[np.ndarray, "steps"]:
-        """Return, for each step, True if the table and the run's series have equal numbers of flips."""
+        """Return, for each step, whether the table has as many flips as the series."""
         return (self.entered == series["entered"]) & (self.left == series["left"])
 
     def _follow(self) -> None:
@@ -202,9 +201,9 @@ def scan(flips: Flips, steps: int | None = None, nearest: int = 0) -> Scan:
 
 
 def margins_in_bounds(flips: Flips) -> Float[np.ndarray, "flips"]:
-    """Return |margin| divided by its rounding bound for each flip; ambiguous flips have ratios up to 1.
+    """Return |margin| / rounding bound of each flip. Flips with ratios up to 1 are ambiguous.
 
-    If the rounding bound is zero (an exact comparison), the ratio of any nonzero margin is infinite.
+    With a bound of zero, the ratio of a nonzero margin is infinite.
     """
     margin, bound = np.abs(flips["margin"]), flips["bound"]
     ratio = np.full(margin.shape, np.inf)
@@ -214,11 +213,11 @@ def margins_in_bounds(flips: Flips) -> Float[np.ndarray, "flips"]:
 
 
 def expected_ambiguous(ratio: Float[np.ndarray, "flips"]) -> float:
-    """Return the expected number of ambiguous flips (ratio up to 1) if margins are spread evenly near zero.
+    """Return the expected number of ambiguous flips, for evenly spread margins.
 
     Margins are spread evenly if atoms move freely through the cutoff distance. The density of margins is
-    estimated from the smallest quarter of the margins. If many more flips are ambiguous than expected, pairs
-    stay near the cutoff, for example because a neighbor shell of a crystal is at this distance.
+    estimated from the smallest quarter of the margins. More ambiguous flips than expected show that pairs
+    stay near the cutoff. An example is a crystal with a neighbor shell at this distance.
     """
     ratio = ratio[np.isfinite(ratio)]
     if len(ratio) < 4:
@@ -228,7 +227,7 @@ def expected_ambiguous(ratio: Float[np.ndarray, "flips"]) -> float:
 
 
 def algebra_holds(series: Mapping[str, np.ndarray]) -> Bool[np.ndarray, "steps"]:
-    """Return, for each step, True if pairs inside = initial pairs inside + pairs entered - pairs left."""
+    """Return, for each step, whether pairs inside = initial pairs + pairs entered - pairs left."""
     pairs = series["pairs"]
     net = np.cumsum(series["entered"].astype(np.int64) - series["left"])
     return pairs == pairs[0] + net - net[0]
@@ -249,11 +248,10 @@ class Conservation:
         kinetic: Float[np.ndarray, "rows"],
         least: float,
     ) -> Conservation | None:
-        """Compute fluctuation and drift of the conserved energy; None for too few rows or for atoms at rest.
+        """Compute fluctuation and drift of the conserved energy. None for few rows or atoms at rest.
 
-        The linear trend of the energy is removed before the fluctuation is computed, since the drift is
-        reported separately. The first half of the run is omitted, because atoms that start on lattice sites
-        lose half of their kinetic energy to potential energy.
+        The fluctuation does not include the linear trend. The first half of the run is omitted: atoms on
+        lattice sites lose half of their kinetic energy at the start.
 
         Args:
             conserved: the energy that should be constant. kinetic: the kinetic energy.
@@ -276,7 +274,7 @@ class Conservation:
 
 
 def range_table(label: Callable[[str], str], *tables: Mapping[str, np.ndarray]) -> Table:
-    """Tabulate the ranges of quantities, and the first step at which narrower float formats cannot hold them.
+    """Tabulate the ranges of quantities, and when they leave narrower float formats.
 
     Args:
         label: function that returns the label of a quantity from its name.

@@ -1,6 +1,6 @@
-"""Detection of flips in any trajectory: pairs that enter or leave a cutoff between the frames of a file.
+"""Detection of flips in trajectories of any program.
 
-`NeighborFlips` is an MDAnalysis analysis class; the command `mdnum flips` runs the same analysis.
+`NeighborFlips` is an MDAnalysis analysis class. `mdnum flips` runs the same analysis.
 """
 
 from __future__ import annotations

@@ -1,15 +1,13 @@
-"""Resolution of the positions in a file, inferred from the numbers, and its effect on pair decisions.
+"""Resolution of the positions in a file, and its effect on pair decisions.
 
-Rounding to three decimals changes every coordinate by up to half a unit of the third decimal. The decision
-whether a pair is inside the cutoff is uncertain if pair distance and cutoff differ by less than the rounding
-error of a distance. `infer` finds the decimal grid of the coordinates, so that no documented precision is
-needed.
+A file with three decimals changes every coordinate by up to 0.0005. Rounding can change the decision whether
+a pair near the cutoff is inside. `infer` finds the decimal grid from the coordinates.
 
-Rounding of coordinates can move a cutoff crossing to another frame, hide a short contact, or create a
-crossing of a pair near the cutoff. The affected flips cannot be identified from one file, but their number is
-estimated by `grid_effect`. Random pairs near the cutoff are moved by displacements found in the file. Flips
-are then counted with and without rounding. With a nearest-neighbor rule, a flip exchanges two atoms at
-similar distances from a third atom. For nearest-neighbor rules, random triples of atoms are moved.
+Rounding can move a cutoff crossing to another frame, hide a short contact, or create a crossing. One file
+does not show which flips rounding changes. `grid_effect` estimates their number. Random pairs near the cutoff
+are moved by displacements found in the file. Flips are then counted with and without rounding. In a
+nearest-neighbor rule, a flip exchanges two neighbors at similar distances. For nearest-neighbor rules, random
+triples of atoms are moved.
 """
 
 from __future__ import annotations
@@ -53,7 +51,7 @@ _WIDE = 4.0
 
 @dataclass(frozen=True)
 class Resolution:
-    """Resolution of the positions in a file: a decimal grid or a floating-point format."""
+    """Resolution of the positions in a file."""
 
     # "grid" (decimals of a length), "fractions" (decimals of the box's vectors), "float32", "float64", or
     # "unknown" where every coordinate looked at is 0 (bounds are then those of float32)
@@ -69,15 +67,15 @@ class Resolution:
     told: bool = True  # whether the coordinates determine it; where all are 0, it is the format's usual one
 
     def bound(self, frame: Frame, atoms: AtomIndices = None) -> float:
-        """Return the largest error of a distance in a frame due to rounding of the data in the file.
+        """Return the largest rounding error of a distance in a frame.
 
-        The bound, a length, is the worst case: rounding moves both atoms in opposite directions by half a
-        grid spacing along every axis. For pairs across the boundary, the rounding error of the box is added.
-        For float64 positions, the bound is the rounding error of the distance. The difference between a
-        distance and the cutoff has the same bound. The difference between two neighbors' distances has twice
-        the bound. If `atoms` are given, the bound is valid for distances between the given atoms.
+        The bound is a length. In the worst case, both atoms move in opposite directions by half a grid
+        spacing along every axis. For pairs across the boundary, the rounding error of the box is added. For
+        float64 positions, the bound is the rounding error of the distance. The difference between a distance
+        and the cutoff has the same bound. The difference between two neighbors' distances has twice the
+        bound. If `atoms` are given, the bound holds for distances between these atoms.
 
-        Error: the bound is valid within one period of the box; further periods each add the error of the box.
+        Error: the bound holds within one period of the box. Each further period adds the error of the box.
         """
         if atoms is not None or not np.isfinite(frame.furthest):
             x = frame.positions if atoms is None else frame.positions[atoms]
@@ -100,7 +98,7 @@ class Resolution:
         return float(2 * np.sqrt(3) * coordinate + box + arithmetic)
 
     def usual_step(self, frame: Frame) -> float:
-        """Return the root mean square size of the last digit of a coordinate, in length units."""
+        """Return the root mean square size of the last digit, in length units."""
         if not len(frame.positions):
             return 0.0
         if not self.step:
@@ -117,7 +115,7 @@ class Resolution:
         return self.kind in ("float32", "unknown") or self.bits == 32
 
     def _half(self, frame: Frame) -> float:
-        """Return half the largest spacing of the decimal grid along an axis, in length units."""
+        """Return half the largest grid spacing of an axis, in length units."""
         if not self.step or not len(frame.positions):
             return 0.0
         if self.kind == "fractions":
@@ -213,7 +211,7 @@ def decimal_grid(
 
 
 def steps_of(values: Float[np.ndarray, "*shape"], step: float, digits: int) -> Float[np.ndarray, "*shape"]:
-    """Return the size of the last digit of each number, for fixed decimals or fixed significant digits."""
+    """Return the size of the last digit of each number."""
     if digits == 0:
         return np.full_like(values, step)
     size = np.where(values == 0, 1.0, np.abs(values))
@@ -233,7 +231,7 @@ def _fixed(values: Float[np.ndarray, "values"], slack: Float[np.ndarray, "values
 
 
 def _chance(parts: Float[np.ndarray, "values"]) -> float:
-    """Return the log probability that random values lie as close to a grid as the distances `parts`."""
+    """Return the log probability that random values are as close to a grid as `parts`."""
     return float(np.log(np.maximum(parts, 1e-300)).sum())
 
 
@@ -249,7 +247,7 @@ Places = tuple[Float[np.ndarray, "draws 3"], ...]
 
 @dataclass(frozen=True)
 class GridEffect:
-    """Estimated fractions of flips that are hidden or created by rounding in a file."""
+    """Estimated fractions of flips that rounding hides or creates."""
 
     missed: float  # share of the flips that happened between two frames and are not in the file at that frame
     invented: float  # share of the flips in the file that did not happen at that frame
@@ -266,7 +264,7 @@ def grid_effect(
     ranked: bool = False,
     draws: int = _DRAWS,
 ) -> GridEffect | None:
-    """Estimate how rounding in a file changes the flips at a cutoff or among nearest neighbors.
+    """Estimate how many flips rounding hides and creates.
 
     Args:
         resolution: resolution of the file.
@@ -303,7 +301,7 @@ def grid_effect(
     before, after = _drawn(random, one, other, radius, steps, draws, ranked)
 
     def decided(places: Places) -> np.ndarray:
-        """True if a pair is inside the cutoff, or if atom 2 of a triple is nearer than atom 3 to atom 1."""
+        """True if a pair is inside the cutoff, or if atom 2 of a triple is nearer to atom 1 than atom 3."""
         squares = [((place - places[0]) ** 2).sum(axis=1) for place in places[1:]]
         return squares[0] < (squares[1] if ranked else radius**2)
 
@@ -326,7 +324,7 @@ def _drawn(
     draws: int,
     ranked: bool,
 ) -> tuple[Places, Places]:
-    """Draw random pairs near the cutoff, or triples with equal distances; return old and new positions."""
+    """Draw random pairs near the cutoff, or triples with equal distances. Return old and new positions."""
     moved = [moves[random.integers(len(moves), size=draws)] for moves in (one, other, other)[: 2 + ranked]]
     # the distance of the middle one of three counts twice where the others are on opposite sides
     spread = float(np.sqrt((1 + ranked) * (one**2).mean() + (1 + ranked) * (other**2).mean()))
@@ -348,10 +346,10 @@ def _steps(resolution: Resolution, frame: Frame) -> Float[np.ndarray, "3 3"]:
 
 
 def _moves(sample: Sequence[Frame], size: float) -> Float[np.ndarray, "atoms 3"]:
-    """Return the displacement of every atom from one frame to the next, corrected for rounding.
+    """Return the displacements of all atoms between frames, corrected for rounding.
 
-    Displacements are measured over several frames, until they clearly exceed the spacing of the coordinate
-    grid. The variance due to rounding is subtracted.
+    Displacements span several frames, so that they exceed the spacing of the coordinate grid. The variance
+    due to rounding is subtracted.
     """
     moves, lag, total = np.zeros_like(sample[0].positions), 0, 0.0
     for before, after in pairwise(sample):
@@ -368,11 +366,11 @@ def _moves(sample: Sequence[Frame], size: float) -> Float[np.ndarray, "atoms 3"]
 
 
 def unrounded(variance: float, size: float) -> float:
-    """Return the variance that displacements had before positions were rounded to multiples of `size`.
+    """Return the variance of displacements before rounding to multiples of `size`.
 
-    For a displacement of n + f grid spacings (integer n, 0 <= f < 1), rounding increases the mean square by
-    size² f (1 - f). For normally distributed displacements of variance v, the mean of size² f (1 - f) is, by
-    a Fourier series, size² (1/6 - sum over k of exp(-2 π² k² v / size²) / (π k)²).
+    Rounding increases the mean square of a displacement of n + f grid spacings by size² f (1 - f) (0 <= f <
+    1). For normal displacements of variance v, the mean increase is size² (1/6 - sum over k of exp(-2 π² k² v
+    / size²) / (π k)²).
     """
     low, high, k = 0.0, variance, np.arange(1, 200)
     for _ in range(60):

@@ -1,4 +1,4 @@
-"""Return value of every command: a summary, a verdict, and access to the folder's tables and figures."""
+"""Return value of every command."""
 
 from __future__ import annotations
 
@@ -19,10 +19,10 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, repr=False)
 class Outcome:
-    """Return value of every command: a summary and a verdict, with methods that read tables and figures.
+    """Summary and verdict of a command. Methods read its tables and figures.
 
-    An outcome can be pickled and returned by worker processes. Tables, figures and the page are read from the
-    output folder on first use, so the folder must not be moved.
+    An outcome can be pickled and returned by worker processes. Do not move the output folder: tables and
+    figures are read on first use.
 
     Example:
         >>> outcome = mdnum.run("argon/crystal-108", steps=200)
@@ -62,13 +62,13 @@ class Outcome:
 
     @property
     def page(self) -> Page:
-        """Content of report.html and of the terminal output; raises FolderError if the folder is missing."""
+        """Content of report.html and of the terminal output. Raises FolderError if the folder is missing."""
         if self._page is None:
             object.__setattr__(self, "_page", self._read(self._place).page)
         return cast(Page, self._page)
 
     def table(self, name: str) -> pa.Table:
-        """Return a table of the output folder; `.to_pandas()` converts the table to a data frame.
+        """Return a table of the output folder. `.to_pandas()` converts it to a data frame.
 
         Raises:
             FolderError: no table has this name (the message lists all tables), or the table is damaged.
@@ -86,7 +86,7 @@ class Outcome:
             return folder.table(name)
 
     def plot(self, name: str) -> Axes:
-        """Draw a figure of the page as a new pyplot figure; `name` is the name of its file in figures/.
+        """Draw a figure of the page as a new pyplot figure. `name` is the name of its file in figures/.
 
         Returns:
             the matplotlib axes, or the first axes if there are several; `.figure.axes` lists all axes.

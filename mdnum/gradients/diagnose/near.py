@@ -1,14 +1,13 @@
-"""Pairs whose distance has an extremum near the cutoff: contributions of flips that almost happened.
+"""Pairs that turn back near the cutoff, and their effect on gradients.
 
 A pair that turns back just outside its cutoff causes no flip. If the pair came slightly closer, it would
-cross the cutoff twice at a radial speed near zero. The contribution of a crossing to the gradient is
-proportional to the inverse of the radial speed. Conversely, if a pair comes inside the cutoff by only a small
-distance, a small perturbation can remove both crossings and their contribution. Therefore, all turning points
-near the cutoff are examined, on both sides and also between two steps.
+cross the cutoff twice at a low radial speed. A crossing contributes to the gradient in proportion to 1 /
+radial speed. A pair that turns back just inside the cutoff has two crossings. A small perturbation can remove
+them. Therefore, all turning points near the cutoff are examined, also those between two steps.
 
 Near the turning point the distance is r(t) = r_m + a (t - t_m)² / 2. A pair that passes the cutoff by a depth
-d crosses the cutoff twice at speed sqrt(2 a d). If w is the contribution of one crossing at unit speed, the
-two crossings contribute 2 w / sqrt(2 a d).
+d crosses the cutoff at speed sqrt(2 a d). Two crossings contribute 2 w / sqrt(2 a d), where w is the
+contribution at unit speed.
 """
 
 from __future__ import annotations
@@ -77,12 +76,12 @@ class Turns:
 
     @property
     def gap(self) -> Float[np.ndarray, "turns"]:
-        """Distance from r to r_cut in a run with shorter time steps; negative if the pair crossed r_cut."""
+        """Distance from the turning point to r_cut. Negative if the pair crossed r_cut."""
         return self.table["gap"] + self.table["side"] * self.table["finer"]
 
     @property
     def reach(self) -> Float[np.ndarray, "turns"]:
-        """Uncertainty of the pair distance at turning points, from runs with other time steps or rounding."""
+        """Uncertainty of the distance at each turning point, from other runs."""
         if not len(self):
             return np.zeros(0)
         shift = self.table["shift"]
@@ -94,14 +93,14 @@ class Turns:
 
     @property
     def within(self) -> np.ndarray:
-        """True if a distance equals the cutoff within its error, or if a crossing has no recorded flip."""
+        """True if a distance equals the cutoff within its error, or a crossing was not recorded."""
         return (np.abs(self.gap) <= self.reach) | self.table["unseen"]
 
     @property
     def term(self) -> Float[np.ndarray, "turns columns"]:
-        """Magnitude of the contribution that the two crossings at each turning point may have. If distance
-        and cutoff agree within the uncertainty, the pair is assumed to pass the cutoff by 1 % of the
-        uncertainty. Otherwise, the result is the change of the contribution in a run with shorter time steps.
+        """Largest possible contribution of the two crossings at each turning point. A distance that equals
+        the cutoff within its uncertainty is assumed to pass it by 1 % of the uncertainty. For other pairs,
+        the result is the change of the contribution with shorter time steps.
         """
         bend, reach = self.table["bend"], self.reach
 
@@ -118,7 +117,7 @@ class Turns:
     def heaviest(
         self, words: tuple[str, ...], named: Callable[[Any], dict[str, Any]], most: int = 10
     ) -> list[dict[str, Any]]:
-        """Return the turning points with the largest possible contributions, as rows of plain values.
+        """Return the turning points with the largest contributions, as plain values.
 
         Args:
             named: returns further columns for a kind of decision.
@@ -139,7 +138,7 @@ class Turns:
 
 @dataclass
 class Near:
-    """Collector of extrema of pair distances, their derivatives, and their changes in other runs."""
+    """Collector of turning points near the cutoff in a reverse pass."""
 
     simulation: Simulation
     pace: Pace  # how often the loss looks
@@ -152,11 +151,11 @@ class Near:
 
     @property
     def jumps(self) -> bool:
-        """True if crossings contribute to the gradient: force or energy of a pair jumps at the cutoff."""
+        """True if the force or energy of a pair jumps at the cutoff."""
         return self.simulation.pairwise and bool(np.any(np.asarray(self.simulation.jumps())))
 
     def reverse(self, stretch: TapeStretch, trace: AdjointCarry) -> None:
-        """Find turning points in a stretch of steps, and compute their weights from loss derivatives."""
+        """Find turning points in a stretch of steps, with their weights."""
         if not self.jumps:
             return
         simulation = self.simulation
@@ -182,7 +181,7 @@ class Near:
         found["weight"] = force * along + seen
 
     def tangents(self, part: StretchTangents) -> None:
-        """Compute from tangents how each parameter changes r_cut - r at the turning points of pairs."""
+        """Compute how each parameter changes r_cut - r at turning points."""
         simulation, stretch = self.simulation, part.stretch
         if part.dr is not None and part.dr_cut is not None:
             self.moved.append(part.dr_cut - part.dr)
@@ -206,7 +205,7 @@ class Near:
         found["moved"] = np.asarray(along.r_cut).T[found["kind"]] - dr
 
     def compared(self, stretch: TapeStretch, per: int) -> None:
-        """Compare distances at turning points with those in a run with `per` times as many steps."""
+        """Compare turning points with those of a run with `per` times as many steps."""
         cell, place = HostCell(self.simulation.cell), stretch.table.place
         for found in self._found.values():
             for earlier, name in ((1, "before"), (0, "after")):
@@ -237,7 +236,7 @@ class Near:
 
 
 def _joined(rows: list[dict[str, np.ndarray]], **more: np.ndarray) -> dict[str, np.ndarray]:
-    """Concatenate tables of turning points; return an empty table if no table is given."""
+    """Concatenate tables of turning points. Without tables, the result is empty."""
     empty = {name: np.zeros(0, np.int64) for name in _WHOLE}
     empty |= {name: np.zeros((0, 3)) for name in _VECTORS} | {name: np.zeros(0) for name in _NUMBERS}
     empty |= more
@@ -248,7 +247,7 @@ def _joined(rows: list[dict[str, np.ndarray]], **more: np.ndarray) -> dict[str, 
 def hermite(
     r0: np.ndarray, s0: np.ndarray, r1: np.ndarray, s1: np.ndarray, time: float
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Find the extremum of the cubic through two distances whose rates of change have opposite signs.
+    """Find the extremum of a cubic between two distances.
 
     Args:
         r0, s0, r1, s1: distance and its rate at the two ends. time: between the ends.
@@ -269,7 +268,7 @@ def hermite(
 
 
 def turning(simulation: Simulation, stretch: TapeStretch) -> dict[str, np.ndarray]:
-    """Find turning points of pairs near their cutoff in a stretch of steps, by cubic interpolation.
+    """Find turning points near the cutoff in a stretch of steps.
 
     Returns:
         the table of `Turns`, with weights and shifts still 0, and without the column `moved`.
