@@ -1,4 +1,4 @@
-"""Measure the numerical noise and the number of digits of a calculator's energies and forces."""
+"""Noise and number of digits of a calculator's energies and forces."""
 
 from __future__ import annotations
 
@@ -60,7 +60,7 @@ _FORMATS = ((8, "bfloat16"), (_HALF, "half precision"), (24, "single precision")
 
 @dataclass(frozen=True)
 class NoiseFloor:
-    """Noise level of energies and forces: differences below this level do not indicate an error."""
+    """Noise level of energies and forces. Smaller differences do not indicate an error."""
 
     energy: float  # standard deviation, eV
     force: float  # standard deviation of a component, of the atom that scatters most, eV/Å
@@ -68,7 +68,7 @@ class NoiseFloor:
     freedom: float = math.inf  # independent values that the standard deviations were estimated from
 
     def louder(self, other: NoiseFloor) -> NoiseFloor:
-        """Combine two noise levels: take the larger noise, and the smaller number of degrees of freedom."""
+        """Combine two noise levels: the larger noise and the smaller number of degrees of freedom."""
         return NoiseFloor(
             max(self.energy, other.energy), max(self.force, other.force), max(self.typical, other.typical),
             min(self.freedom, other.freedom),
@@ -76,10 +76,9 @@ class NoiseFloor:
 
     @property
     def allowed(self) -> NoiseFloor:
-        """Largest differences of energies and forces that noise can explain, used in all comparisons.
+        """Largest differences of energies and forces that noise can explain.
 
-        A standard deviation estimated from few values may be far too small by chance, so the limit is
-        computed with Student's t distribution.
+        The limit uses Student's t distribution, because the noise is estimated from few values.
         """
         student = math.sqrt(2) * float(-stdtrit(min(self.freedom, 1e9), _BY_CHANCE / 2))
         return replace(self, **{
@@ -90,7 +89,7 @@ class NoiseFloor:
 def along_a_line(
     subject: CalculatorSubject, atoms: Atoms, rng: np.random.Generator, points: int = _POINTS
 ) -> NoiseFloor:
-    """Estimate the noise from high-order differences at equally spaced points, which cancel smooth functions.
+    """Estimate the noise from high-order differences at equally spaced points.
 
     Source:
         J. J. Moré and S. M. Wild, Estimating computational noise, SIAM J. Sci. Comput. 33, 1292 (2011).
@@ -117,7 +116,7 @@ def along_a_line(
 
 @dataclass(frozen=True)
 class Staircase:
-    """Size of the discrete steps by which energies and forces change along a line in configuration space."""
+    """Size of the discrete steps of energies and forces along a line of structures."""
 
     energy: float  # the size of a step, eV; 0 where there are none
     force: float  # of a force component, eV/Å
@@ -128,10 +127,10 @@ class Staircase:
 
 
 def steps(subject: CalculatorSubject, atoms: Atoms) -> Staircase:
-    """Detect energies and forces that stay exactly constant as an atom moves, and then change in steps.
+    """Detect energies and forces that change only in discrete steps as an atom moves.
 
-    If an atom moves by 1e-4 Å, every smooth energy or force changes, even in single precision. Points with
-    the same energy and forces as the previous point are ignored, because they may be cached.
+    A smooth energy or force changes if an atom moves by 1e-4 Å, even in single precision. Points with
+    unchanged energy and forces are ignored, because they may be cached.
     """
     key = ("steps", atoms.positions.tobytes(), atoms.cell.array.tobytes())
     if key in subject.known:
@@ -165,7 +164,7 @@ def steps(subject: CalculatorSubject, atoms: Atoms) -> Staircase:
 
 
 def rounding(subject: CalculatorSubject, atoms: Atoms) -> NoiseFloor:
-    """Return the noise caused by discrete steps and by the limited digits of energies and forces."""
+    """Return the noise due to discrete steps and to limited digits."""
     stairs = steps(subject, atoms)
     energies = stairs.energies
     grain = max(stairs.energy, digits(energies).grain(energies), _quantum(energies))
@@ -173,7 +172,7 @@ def rounding(subject: CalculatorSubject, atoms: Atoms) -> NoiseFloor:
 
 
 def _quantum(values: Float[np.ndarray, "points"]) -> float:
-    """Return a common divisor of those second differences that exceed rounding errors; 0 if none exists."""
+    """Return a common divisor of second differences that exceed rounding errors. 0 if there is none."""
     sizes = np.abs(np.diff(values, n=2))
     sizes = sizes[sizes > np.spacing(largest(values)) / _ALIKE]
     for part in (1, 2, 3) if sizes.size else ():
@@ -184,7 +183,7 @@ def _quantum(values: Float[np.ndarray, "points"]) -> float:
 
 
 def scatter(values: Float[np.ndarray, "points columns"]) -> Float[np.ndarray, "columns"]:
-    """Standard deviation of the noise in each column of values, from differences of orders 4, 5 and 6."""
+    """Standard deviation of the noise in each column, from differences of orders 4, 5 and 6."""
     found = []
     for order in (4, 5, 6):
         weight = math.factorial(order) ** 2 / math.factorial(2 * order)
@@ -195,11 +194,11 @@ def scatter(values: Float[np.ndarray, "points columns"]) -> Float[np.ndarray, "c
 def order_change(
     subject: CalculatorSubject, atoms: Atoms, noise: NoiseFloor, rng: np.random.Generator
 ) -> tuple[float, NoiseFloor]:
-    """Reorder the atoms; return the largest energy change (eV), and the noise if rounding explains it.
+    """Reorder the atoms. Return the largest energy change (eV), and the noise if rounding explains it.
 
-    The noise is 0 if rounding does not explain the energy change. The noise is also 0 if energies and forces
-    change by no more than the noise along a line of structures. While atoms move along a line, the rounding
-    error of a sum varies randomly, but an error due to missing terms varies smoothly.
+    The noise is 0 if rounding does not explain the energy change. It is also 0 if energies and forces vary by
+    no more than the noise along a line of structures. Along a line, a rounding error varies randomly. An
+    error due to missing terms varies smoothly.
     """
     count, none = len(atoms), NoiseFloor(0.0, 0.0)
     if count < 2:
@@ -235,7 +234,7 @@ def order_change(
 
 
 def measured(subject: CalculatorSubject, atoms: Atoms, rng: np.random.Generator) -> NoiseFloor:
-    """Return the larger of two noise levels: along a line of structures, and from reordering the atoms."""
+    """Return the larger noise of two tests: a line of structures, and reordered atoms."""
     noise = along_a_line(subject, atoms, rng)
     return noise.louder(order_change(subject, atoms, noise, rng)[1])
 
@@ -243,7 +242,7 @@ def measured(subject: CalculatorSubject, atoms: Atoms, rng: np.random.Generator)
 def in_order(
     subject: CalculatorSubject, atoms: Atoms, order: Int[np.ndarray, "atoms"]
 ) -> tuple[float, Forces]:
-    """Compute energy and forces for reordered atoms; the forces are returned in the original order."""
+    """Compute energy and forces for reordered atoms. The forces have the original order."""
     there = atoms[order]
     assert isinstance(there, Atoms)
     energy, forces = subject.both(there)
@@ -253,7 +252,7 @@ def in_order(
 
 
 def _odd_one(values: Float[np.ndarray, "points"]) -> int:
-    """Return the index of the point whose removal leaves the other points closest to a parabola."""
+    """Return the index of the point whose removal leaves the best parabola."""
     at = np.arange(len(values)) - len(values) // 2
     # of values that are all large, what they have in common has no digits to spare
     values = values - np.median(values)
@@ -267,10 +266,9 @@ def _odd_one(values: Float[np.ndarray, "points"]) -> int:
 def under_jitter(
     subject: CalculatorSubject, atoms: Atoms, size: float, rng: np.random.Generator
 ) -> NoiseFloor:
-    """Largest change of the energy and of a force component for random displacements of up to `size` Å.
+    """Largest change of energy and force component for random displacements of up to `size` Å.
 
-    Rounding the coordinates of a periodic image or of a rotated structure displaces atoms by up to one unit
-    in the last place of the largest coordinate.
+    The coordinates of a periodic image are rounded by up to one unit in the last place.
     """
     base, worst = subject.both(atoms), NoiseFloor(0.0, 0.0)
     for _ in range(_DRAWS):
@@ -287,11 +285,10 @@ def under_jitter(
 def settled(
     subject: CalculatorSubject, rng: np.random.Generator, at_least: int = FEW, brief: bool = False
 ) -> tuple[Atoms, NoiseFloor]:
-    """Displace atoms slightly, so that no pair is at a distance threshold; return structure and noise.
+    """Displace atoms slightly, away from distance thresholds. Return the structure and its noise.
 
-    In a perfect crystal, a whole neighbor shell can lie exactly at a cutoff, which would disturb the checks
-    that do not test thresholds. A jump of the energy along the sampled line would be counted as noise. Of
-    several random displacements, the one with the least noise is therefore used.
+    In a perfect crystal, a whole neighbor shell can lie exactly at a cutoff. An energy jump would be counted
+    as noise. Of several random displacements, the one with the least noise is therefore used.
 
     Args:
         at_least: minimum number of atoms; a smaller periodic cell is repeated.
@@ -332,7 +329,7 @@ def settled(
 
 
 def roomy(atoms: Atoms, at_least: int) -> Atoms:
-    """Repeat a structure along its periodic axes until it has at least `at_least` atoms."""
+    """Repeat a structure along its periodic axes until it has enough atoms."""
     if len(atoms) >= at_least or not len(atoms) or not atoms.pbc.any():
         return atoms
     times = math.ceil((at_least / len(atoms)) ** (1 / int(atoms.pbc.sum())))
@@ -340,13 +337,13 @@ def roomy(atoms: Atoms, at_least: int) -> Atoms:
 
 
 def direction(atoms: int, rng: np.random.Generator) -> Float[np.ndarray, "atoms 3"]:
-    """Return random displacements of all atoms, scaled so that the longest has length 1."""
+    """Return random displacements of all atoms. The longest has length 1."""
     drawn = rng.standard_normal((atoms, 3))
     return drawn / np.max(np.linalg.norm(drawn, axis=1))
 
 
 def displaced(atoms: Atoms, by: Float[np.ndarray, "*atoms 3"]) -> Atoms:
-    """Return a copy of a structure with every atom displaced by the given vectors, Å."""
+    """Return a copy of a structure with displaced atoms (Å)."""
     there = atoms.copy()
     there.positions += by
     return there
@@ -354,28 +351,28 @@ def displaced(atoms: Atoms, by: Float[np.ndarray, "*atoms 3"]) -> Atoms:
 
 @dataclass(frozen=True)
 class Digits:
-    """Number of decimal places and of significand bits used by a set of numbers."""
+    """Number of decimal places and of significand bits in a set of numbers."""
 
     decimals: int | None  # they are rounded to; None where to none
     bits: int  # of their significands, at most; 53 for a double that is used in full
 
     @property
     def quantum(self) -> float:
-        """Spacing of numbers that are rounded to a fixed number of decimals; 0 for unrounded numbers."""
+        """Spacing of numbers with a fixed number of decimals. 0 for unrounded numbers."""
         return 0.0 if self.decimals is None else 10.0**-self.decimals
 
     def grain(self, values: np.ndarray) -> float:
-        """Return the spacing of the rounded numbers at the largest absolute value of the given values."""
+        """Return the spacing of the rounded numbers at the largest absolute value."""
         return max(self.quantum, 2.0**-self.bits * largest(values))
 
     @property
     def format(self) -> str | None:
-        """Name of the narrowest floating-point format that can hold the numbers; None if there is none."""
+        """Narrowest floating-point format that can hold the numbers. None if there is none."""
         return next((name for most, name in _FORMATS if self.bits <= most), None)
 
 
 def digits(values: np.ndarray) -> Digits:
-    """Return how many decimal places and bits values use; values count as unrounded if few are distinct."""
+    """Return the decimal places and bits of the values. Few distinct values count as unrounded."""
     found = np.unique(np.asarray(values, dtype=np.float64))
     found = found[np.isfinite(found) & (found != 0.0)]
     if len(found) < _FEWEST:
@@ -389,10 +386,10 @@ def digits(values: np.ndarray) -> Digits:
 
 
 def precision(subject: CalculatorSubject, atoms: Atoms, noise: NoiseFloor) -> Iterator[Observed]:
-    """Yield a finding, QUANTIZED or LOW_PRECISION, if energies or forces carry fewer digits than a double.
+    """Yield a finding if energies or forces have fewer digits than a double.
 
-    Discrete steps are measured along a line of structures, because they can be invisible in the digits. For
-    example, forces that are rounded before a unit conversion use all digits of a double.
+    Discrete steps are measured along a line of structures, because digits may not show them. For example,
+    forces rounded before a unit conversion use all digits.
     """
     stairs = steps(subject, atoms)
     size, typical = largest(stairs.energies), rms(stairs.forces)

@@ -1,7 +1,7 @@
-"""Command line of mdnum: parsing of arguments, calls of commands, and printing, without import of jax.
+"""Command line of mdnum: arguments, commands and printing. It does not import jax.
 
-The exit code of a command is 0 without findings, 1 with findings, 2 for invalid input, and 3 if the time
-limit ended the command before a verdict.
+The exit code is 0 without findings, 1 with findings and 2 for invalid input. It is 3 if the time limit ended
+the command.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ _UsageError: Any = typer.BadParameter.__base__
 
 
 def programs_folder() -> str:
-    """Return the name of the cache folder for functions that were compiled for this kind of processor."""
+    """Return the name of the cache folder for compiled functions of this kind of processor."""
     features = platform.machine()
     with contextlib.suppress(OSError), open("/proc/cpuinfo") as file:
         features = next((line for line in file if line.startswith(("flags", "Features"))), features)
@@ -63,7 +63,7 @@ def _keep_programs() -> None:
 
 
 def _set_up() -> None:
-    """Change settings of the whole process, such as garbage collection and the compilation cache."""
+    """Change settings of the process, such as garbage collection."""
     # imports and compilers make half a million objects that stay: walking them for garbage takes a sixth of a
     # short command's time, and walking them once more as the process ends half a second
     gc.set_threshold(1_000_000, 20, 20)
@@ -82,7 +82,7 @@ def _set_up() -> None:
 
 
 def _no_device(error: BaseException) -> str | None:
-    """Return a message if jax failed because JAX_PLATFORMS names a missing device, else None."""
+    """Return a message if JAX_PLATFORMS names a missing device. None for other errors."""
     platforms, trace = os.environ.get("JAX_PLATFORMS"), error.__traceback__
     while trace is not None and trace.tb_next is not None:
         trace = trace.tb_next
@@ -143,7 +143,7 @@ _EXPECTED = {"int_parsing": "a whole number", "int_from_float": "a whole number"
 
 
 def _said(error: Any) -> str:
-    """Return the message of a usage error; if a number was expected, the message quotes the invalid text."""
+    """Return the message of a usage error. It quotes the text if a number was expected."""
     details = getattr(error.__cause__, "errors", None)
     if details is None or details()[0]["type"] not in _EXPECTED:
         return error.format_message()

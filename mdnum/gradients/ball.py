@@ -1,11 +1,11 @@
 """Gradient methods for a simulated bouncing ball; the methods treat contact decisions differently.
 
-The methods in this module differentiate the executed operations (unrolled), the program with all decisions
-fixed (frozen), or the loss averaged over random parameters (randomized). Methods that replace the contact by
-another model are in `ball_contacts`.
+The methods differentiate the executed operations (unrolled), the program with fixed decisions (frozen), or
+the loss averaged over random parameters (randomized). Methods that replace the contact by another model are
+in `ball_contacts`.
 
-JAX returns a derivative of 0.0 if the run did not use a parameter, but also if the derivative underflowed or
-was clamped to zero. The function `dependence` distinguishes the two cases.
+JAX returns a derivative of 0.0 if the run did not use a parameter. It also returns 0.0 if the derivative
+underflowed or was clamped. The function `dependence` distinguishes the two cases.
 """
 
 from __future__ import annotations
@@ -38,20 +38,20 @@ class Use(NamedTuple):
 
 
 class BallMethod(Method):
-    """Base class of gradient methods for a ball, which are called with a `BallProblem`.
+    """Base class of gradient methods for a ball. A method is called with a `BallProblem`.
 
-    The parameters y0 and v0 (height and velocity at the start) shift all balls of a batch together.
+    The parameters y0 and v0 (initial height and velocity) shift all balls of a batch.
     """
 
     def known(self, problem: BallProblem, names: Sequence[str]) -> tuple[str, ...]:
-        """Return the names of parameters unchanged; raise an error if a name is unknown."""
+        """Return the given names of parameters. Raise an error if a name is unknown."""
         problem.values(names)
         return tuple(names)
 
     def of(
         self, value: float, slopes: dict[str, float], use: dict[str, Use], details: dict[str, Any]
     ) -> Gradient:
-        """Create a `Gradient` from derivatives, details, and notes on which parameters the run used."""
+        """Create a `Gradient` from derivatives, their details and the use of parameters."""
         gradient = {name: np.asarray(slope, np.float64) for name, slope in slopes.items()}
         made = self.result(value, gradient, {name: one.note for name, one in use.items()}, details)
         return replace(made, depends={name: one.depends for name, one in use.items()})
@@ -69,7 +69,7 @@ for _name, _class in {
 
 @result
 class BallGradients:
-    """Derivatives of one loss, computed by several methods, and reasons why other methods do not apply."""
+    """Derivatives of one loss by several methods, and why other methods do not apply."""
 
     gradients: tuple[Gradient, ...]  # of the methods that apply, in the order asked for
     refused: Mapping[str, str]  # why another does not, by its name
@@ -81,7 +81,7 @@ class BallGradients:
 def compare(
     problem: BallProblem, names: Sequence[str], methods: Sequence[str | BallMethod] | None = None
 ) -> BallGradients:
-    """Differentiate one loss by several methods, and record why other methods do not apply.
+    """Differentiate one loss by several methods. Record why other methods do not apply.
 
     Args:
         names: parameters, which may include "y0" and "v0".
@@ -105,7 +105,7 @@ def compare(
 
 
 class Dependence(NamedTuple):
-    """Whether the program uses a parameter to compute the loss, and whether the run did so."""
+    """Whether the program uses a parameter for the loss, and whether the run used it."""
 
     written: bool
     used: bool
@@ -117,10 +117,10 @@ def dependence(
     names: Sequence[str] | None = None,
     rest: tuple[Any, ...] = (),
 ) -> dict[str, Dependence]:
-    """Determine on which parameters a scalar loss depends, in the branches and iterations that ran.
+    """Determine which parameters affect a scalar loss, in the branches that ran.
 
-    A parameter is tested by setting its tangent to NaN. A NaN tangent propagates through every operation that
-    has a derivative (even a zero derivative), but through no other operation.
+    A parameter is tested by setting its tangent to NaN. NaN tangents propagate through every operation with a
+    derivative, even a zero one. They do not propagate through other operations.
 
     Args:
         function: maps a dictionary of parameters, and the rest, to a scalar loss; compiled once, as long as
@@ -157,7 +157,7 @@ def _used(function: Any, values: dict[str, jax.Array], rest: tuple, names: tuple
 
 
 def _written(function: Any, values: dict[str, jax.Array], rest: tuple, name: str) -> bool:
-    """Return whether any branch or loop of the program, executed or not, uses the parameter."""
+    """Return whether any branch or loop of the program uses the parameter, executed or not."""
 
     def slope(tangent):
         return jax.jvp(lambda q: function(values | {name: q}, *rest), (values[name],), (tangent,))[1]
@@ -167,8 +167,9 @@ def _written(function: Any, values: dict[str, jax.Array], rest: tuple, name: str
 
 
 def _plain(program: ClosedJaxpr) -> ClosedJaxpr:
-    """Replace the custom derivative rule of `stopping.elementwise` by plain loops in a program. With the
-    custom derivative rule, a loop with zero derivative looks the same as a loop that did not run.
+    """Replace the custom derivative rule of `stopping.elementwise` by plain loops.
+
+    With the custom rule, a loop with zero derivative looks like a loop that did not run.
     """
 
     def run(*inputs):
@@ -197,7 +198,7 @@ def _plain(program: ClosedJaxpr) -> ClosedJaxpr:
 
 
 class _Rollout(eqx.Module):
-    """Function for the loss after a given number of steps; compiled only once for equal problems."""
+    """The loss after a given number of steps. It is compiled once for equal problems."""
 
     steps: int = eqx.field(static=True)
     loss: BallLoss
@@ -253,7 +254,7 @@ def _note(name: str, found: Dependence, slope: float, problem: BallProblem, run:
 
 @dataclass(frozen=True)
 class ThroughIterations(BallMethod):
-    """Gradient method: derivative of the operations that ran, including all iterations of the solver."""
+    """Gradient method: derivative of the operations that ran, with all iterations of the solver."""
 
     # the reverse pass starts with it instead of 1 (`mdnum.numerics.formats`); a power of two
     loss_scale: float = 1.0
@@ -280,10 +281,9 @@ class ThroughIterations(BallMethod):
 
 @dataclass(frozen=True)
 class Frozen(BallMethod):
-    """Gradient method: derivative of the program with decisions and iteration counts fixed to a recorded run.
+    """Gradient method: derivative with decisions and iteration counts fixed to a recorded run.
 
-    The program with fixed decisions has no branches. Finite differences of a program without branches
-    converge; as a check, central differences are computed in float64.
+    The program with fixed decisions has no branches. Central differences in float64 check the derivative.
     """
 
     name = "frozen"
@@ -292,7 +292,7 @@ class Frozen(BallMethod):
     )
 
     def differentiate(self, problem: BallProblem, names: tuple[str, ...], progress: Any) -> Gradient:
-        """Compute derivatives by reverse mode, and central differences at fixed decisions as a check.
+        """Compute derivatives by reverse mode. Check them by central differences at fixed decisions.
 
         Error: rounding of derivatives; relative error of central differences ~u^(2/3) (u: unit roundoff).
         """
@@ -311,18 +311,17 @@ class Frozen(BallMethod):
 
 
 def _sizes(problem: BallProblem, names: Sequence[str]) -> dict[str, float]:
-    """Return the largest absolute value in the array of each parameter; 1 if all values are 0."""
+    """Return the largest absolute value of each parameter array. 1 if all its values are 0."""
     at = problem.values(names)
     return {name: float(np.max(np.abs(np.asarray(value, np.float64)))) or 1.0 for name, value in at.items()}
 
 
 @dataclass(frozen=True)
 class RandomizedSmoothing(BallMethod):
-    """Gradient method: derivative of E[loss(parameters + width * noise)], estimated from values of the loss.
+    """Gradient method: derivative of E[loss(parameters + width * noise)], from loss values alone.
 
-    The estimate includes the jumps of the loss at parameter values where iteration counts or contacts change.
-    Each noise sample is used with both signs, so that a constant in the loss does not increase the variance.
-    The same random seed gives the same result, bit for bit.
+    The estimate includes jumps of the loss where iteration counts or contacts change. Each noise sample is
+    used with both signs, to reduce the variance. The same random seed gives the same result, bit for bit.
     """
 
     # standard deviation of the noise, as a share of a parameter's size (of 1 where it is 0)

@@ -1,9 +1,8 @@
-"""Losses of a trajectory, which are evaluated frame by frame so that the trajectory need not be stored.
+"""Losses of a trajectory. They are evaluated frame by frame, so no trajectory is stored.
 
-A loss computes observations from each frame (and the first frame), sums the observations over frames, and
-computes a number from these sums. Examples of losses are averages, correlations with the start, and
-histograms. The derivatives of a loss also require only one frame at a time. Each loss that the command line
-offers is a class in this module with a name, a label and a unit.
+A loss computes observations from each frame and sums them over frames. Its value is a function of these sums.
+Examples of losses are averages, correlations with the start, and histograms. The derivatives of a loss also
+require only one frame at a time. Each loss of the command line is a class with a name, a label and a unit.
 """
 
 from __future__ import annotations
@@ -31,7 +30,7 @@ NOT_REAL = ("it is complex; expected a real number", "Use gradients.value_and_gr
 
 
 class LossFrame(NamedTuple):
-    """Input of a loss: state and energies at one step of a trajectory, with the atoms in the user's order."""
+    """State and energies at one step of a trajectory. Atoms are in the user's order."""
 
     step: Int[Array, ""]  # its number
     x: Float[Array, "3 atoms"]  # positions as if the box had no faces, length
@@ -41,7 +40,7 @@ class LossFrame(NamedTuple):
 
 
 class LossContext(NamedTuple):
-    """Quantities that a loss can use in addition to those of a frame, such as masses and the box."""
+    """Quantities for a loss that do not change from frame to frame, such as masses."""
 
     masses: Float[Array, "atoms"]  # of the atoms
     matrix: Float[Array, "3 3"]  # lattice vectors as rows, length
@@ -81,19 +80,19 @@ class Loss(eqx.Module):
         return cls(**options)
 
     def looks_at(self, steps: Int[np.ndarray, "rows"], last: int) -> Bool[np.ndarray, "rows"]:
-        """Return, for each given step of a run that ends at step `last`, whether the loss uses this step."""
+        """Return for each given step whether the loss uses it. `last` is the last step of the run."""
         return (steps >= self.first) & ((steps - self.first) % self.every == 0)
 
     @abstractmethod
     def observe(self, frame: LossFrame, origin: LossFrame, around: LossContext) -> Any:
-        """Return the observations of a frame, to be summed over frames; `origin` is the frame of step 0."""
+        """Return the observations of a frame. `origin` is the frame of step 0."""
 
     def value(self, total: Any, frames: Int[Array, ""] | int) -> Inexact[Array, ""]:
-        """Compute the loss from the sum of observations and the number of frames; by default, the mean."""
+        """Compute the loss from the sum of observations. The default is the mean over frames."""
         return total / frames
 
     def reason_unavailable(self, around: LossContext) -> str | None:
-        """Return the reason why the loss is not defined for this system; None if the loss is defined."""
+        """Return why the loss is not defined for this system. None if it is defined."""
         lacks_volume = self.needs_volume and not float(around.volume) > 0
         return "the box has no volume: it is not periodic everywhere" if lacks_volume else None
 
@@ -136,7 +135,7 @@ class Custom(Loss):
 
 
 class ComplexPart(Loss):
-    """The real part of a constant factor times a complex loss; a factor of -i gives the imaginary part."""
+    """The real part of a complex loss times a constant factor. Factor -i gives the imaginary part."""
 
     name = "part of a complex loss"
     inner: Loss = eqx.field(kw_only=True)
@@ -233,7 +232,7 @@ class EinsteinDiffusion(Loss):
     """Diffusion constant (length² per unit of time) from the slope of the mean squared displacement.
 
     A straight line is fitted to the mean squared displacement since step 0. D is a sixth of the slope of this
-    line. Motion is ballistic at the beginning of a run: set `first` to a step after the ballistic regime.
+    line. Motion is ballistic at first: set `first` to a later step.
 
     Source: Allen and Tildesley, Computer Simulation of Liquids (2017), section 2.7.
     """
@@ -263,10 +262,10 @@ class EinsteinDiffusion(Loss):
 class GreenKuboDiffusion(Loss):
     """Diffusion constant (length² per unit of time) from the integral of the velocity autocorrelation.
 
-    D is a third of the integral of v(0) · v(t), averaged over atoms, from step 0 to step `until`. The
-    integral is computed by the trapezoidal rule with a spacing of `every` steps.
+    D is a third of the integral of v(0) · v(t) from step 0 to step `until`, averaged over atoms. The integral
+    uses the trapezoidal rule with a spacing of `every` steps.
 
-    Error: the integration error is of order (every × timestep)² times the autocorrelation's slope at `until`.
+    Error: of order (every × timestep)² times the slope of the autocorrelation at `until`.
     Source: Allen and Tildesley (2017), section 2.7, as for `EinsteinDiffusion`.
     """
 
@@ -305,8 +304,8 @@ class RadialDistribution(Loss):
     """Loss computed from the radial distribution function g(r), averaged over frames.
 
     Each pair distance contributes to the four nearest bins with cubic B-spline weights. Therefore, g(r) has
-    two continuous derivatives with respect to positions. For N atoms, the computing time of each frame is of
-    order N² and the memory of order N.
+    two continuous derivatives with respect to positions. Each frame of N atoms takes a time of order N² and
+    memory of order N.
 
     Source: Hansen and McDonald, Theory of Simple Liquids (2013), section 2.5.
     """
@@ -349,7 +348,7 @@ class RadialDistribution(Loss):
         return (jnp.arange(self.bins, dtype=jnp.float64) + 0.5) * self.width
 
     def reason_unavailable(self, around: LossContext) -> str | None:
-        """Return why g(r) is not defined (no volume, or too small a box); None if it is defined."""
+        """Return why g(r) is not defined for the box. None if it is defined."""
         if why := super().reason_unavailable(around):
             return why
         half = float(jnp.min(1 / jnp.linalg.norm(jnp.linalg.inv(around.matrix), axis=0))) / 2
@@ -392,7 +391,7 @@ class RadialDistribution(Loss):
 
 
 def _shared(r: Float[Array, "pairs"], near, width: float, bins: int) -> Float[Array, "bins"]:
-    """Histogram of distances, with bin centers at (k + 1/2) * width and cubic B-spline weights."""
+    """Histogram of distances with cubic B-spline weights. Bin centers are (k + 1/2) * width."""
     u = r / width - 0.5
     left = lax.stop_gradient(jnp.floor(u))
     t = u - left

@@ -1,4 +1,4 @@
-"""Compare mdnum with ASE frame by frame (`mdnum check energy`) and step by step (`mdnum check dynamics`)."""
+"""Comparison of mdnum with ASE for single frames and for short runs."""
 
 from __future__ import annotations
 
@@ -63,12 +63,12 @@ class FrameComparison:
 
     @property
     def energy_roundings(self) -> float:
-        """Energy difference between mdnum and the reference, in units of the expected rounding error."""
+        """Energy difference between mdnum and the reference, divided by the expected rounding error."""
         return _over(abs(self.energy - self.energy_reference), self.energy_expected)
 
     @property
     def force_roundings(self) -> float:
-        """Largest force difference between mdnum and the reference, in units of expected rounding error."""
+        """Largest force difference from the reference, divided by the expected rounding error."""
         return _over(self.force_max, self.force_expected)
 
 
@@ -92,7 +92,7 @@ class EnergyReport:
 
     @property
     def worst(self) -> dict[str, Any]:
-        """Largest deviations from the reference over all frames, under the names used in summary.json."""
+        """Largest differences from the reference over all frames. The keys are those of summary.json."""
         stress = [frame.stress_max for frame in self.frames if frame.stress_max is not None]
         names = ("energy_rel", "force_max", "force_scale")
         worst = {name: max(getattr(frame, name) for frame in self.frames) for name in names}
@@ -122,8 +122,7 @@ def check_energy(
     judge: Reference | None = None,
     lammps: bool = False,
 ) -> EnergyReport:
-    """Compare energies, forces and stresses with those of an ASE calculator or, if ASE has no calculator for
-    the potential, of plain numpy.
+    """Compare energies, forces and stresses with those of an ASE calculator or of plain numpy.
 
     Args:
         subject: a `Simulation`, or any argument of `mdnum.build`.
@@ -174,13 +173,13 @@ def check_energy(
 
 
 def narrowest(simulation: Simulation, roles: Sequence[str] = ("state", "force", "accumulate")) -> str:
-    """Return the least precise float type of the given roles (default: state, force and accumulated sums)."""
+    """Return the least precise float type of the given roles."""
     kinds = (carrier(getattr(simulation.policy, role)) for role in roles)
     return max(map(str, kinds), key=unit_roundoff)
 
 
 def _places(simulation: Simulation) -> str:
-    """Return the least precise float type that affects positions; 16-bit types of forces are ignored."""
+    """Return the least precise float type that affects positions. Forces in 16 bits are ignored."""
     wide = simulation.policy.force in WIDE
     return narrowest(simulation) if wide else narrowest(simulation, ("state", "decision"))
 
@@ -203,7 +202,7 @@ def _named(frames: Any, simulation: Any) -> Iterable[tuple[str, Atoms]]:
 
 
 def _evaluated(atoms: Atoms, simulation: Any, stress: bool) -> tuple[Atoms, Evaluation]:
-    """Round a frame to the precision of the state, and evaluate it; return the rounded frame and results."""
+    """Round a frame to the precision of the state. Return the rounded frame and its results."""
     positions = atoms.get_positions()
     if simulation.policy.state == "float32":
         positions = positions.astype(np.float32).astype(np.float64)  # both are to see what the state can hold
@@ -212,7 +211,7 @@ def _evaluated(atoms: Atoms, simulation: Any, stress: bool) -> tuple[Atoms, Eval
 
 
 def _part(mine: Evaluation, cluster: Atoms, chosen: ndarray, r_cut: float) -> Evaluation:
-    """Select results for a cluster's atoms from those for the whole system; add the cluster's atom pairs."""
+    """Return the results for the atoms of a cluster, with its atom pairs."""
     edges = edges_of(cluster, r_cut)
     once = edges.i < edges.j
     pairs = edges.i[once], edges.j[once], edges.r[once]
@@ -266,7 +265,7 @@ def _of_first(results: dict[str, Any], count: int) -> dict[str, Any]:
 
 
 def _over(difference: float, scale: float) -> float:
-    """Return a difference divided by the scale of its quantity; 0 if the difference is 0, even at scale 0."""
+    """Return difference / scale. 0 if the difference is 0, even at scale 0."""
     return 0.0 if difference == 0.0 else float(difference / scale) if scale > 0.0 else float("inf")
 
 
@@ -274,8 +273,9 @@ def _over(difference: float, scale: float) -> float:
 class _Scales:
     """Scales by which differences of energy, force and stress are divided.
 
-    The energy scale is the sum of |energies|, the force scale the largest force on an atom or along a pair,
-    and the stress scale the sum of |virial terms| per volume. Fields *_expected are expected rounding errors.
+    The energy scale is the sum of |energies|. The force scale is the largest force on an atom or along a
+    pair. The stress scale is the sum of |virial terms| per volume. Fields *_expected are expected rounding
+    errors.
     """
 
     energy: float
@@ -287,7 +287,7 @@ class _Scales:
 
     @classmethod
     def of(cls, simulation: Simulation, atoms: Atoms, mine: Any, theirs: Mapping[str, Any]) -> _Scales:
-        """Return the scales of energy, force and stress, from pairs or, for many-body potentials, totals."""
+        """Return the scales of energy, force and stress. Many-body potentials use totals, others pairs."""
         unit, places = unit_roundoff(narrowest(simulation)), unit_roundoff(_places(simulation))
         largest_force = float(np.abs(theirs["forces"]).max(initial=0.0))
         volume = atoms.get_volume() if atoms.cell.rank == 3 else float("inf")
@@ -331,7 +331,7 @@ class _Scales:
 
 
 def _ambiguous(model: PairModel, atoms: Atoms, unit: float) -> int:
-    """Return the number of pairs whose distance is within rounding error of the cutoff, on either side."""
+    """Return the number of pairs whose distance equals the cutoff within rounding error."""
     bound = rounding_bound(atoms.get_positions(), np.asarray(atoms.cell), model.reach, unit_roundoff=unit)
     # as the judges asked for it, where that has the room: the list is made once
     edges = edges_of(atoms, model.reach + (bound if bound > SLACK / 2 * model.reach else 0.0))
@@ -344,7 +344,7 @@ def _ambiguous(model: PairModel, atoms: Atoms, unit: float) -> int:
 
 
 def _rollout(simulation: Any, steps: int) -> Iterator[tuple[ndarray, ndarray, float]]:
-    """Yield unwrapped positions, velocities and potential energy at every step, starting at step 0."""
+    """Yield unwrapped positions, velocities and potential energy at every step, from step 0."""
     from mdnum.rollout.engine import Engine, unwrapped
 
     for segment in Engine(simulation, steps).segments():
@@ -397,7 +397,7 @@ class DynamicsReport:
 
 
 def check_dynamics(subject: Any, steps: int = 100, *, judge: Reference | None = None) -> DynamicsReport:
-    """Compare a run with a velocity Verlet run of ASE that starts from the same positions and velocities.
+    """Compare a run with a velocity Verlet run of ASE from the same start.
 
     A thermostat is switched off. A hard cutoff gives the same forces as ASE's shifted potential. The
     trajectories must therefore agree, although the energies differ by constants.
@@ -436,7 +436,7 @@ def check_dynamics(subject: Any, steps: int = 100, *, judge: Reference | None = 
 
 
 def _forces(simulation: Simulation) -> Reference:
-    """Return the reference calculator, from ASE or, if ASE is slow (Tersoff, mixtures), in plain numpy."""
+    """Return the reference calculator: ASE, or plain numpy where ASE is slow (Tersoff, mixtures)."""
     judge = reference(simulation)
     slow = isinstance(simulation.model, Tersoff) or len(simulation.symbols) > 1
     return independent(simulation) if slow and not isinstance(simulation.potential, EmbeddedAtom) else judge
@@ -448,7 +448,7 @@ def _sudden(position: Sequence[float], floor: float) -> int | None:
 
 
 def _growth(position: Sequence[float]) -> float:
-    """Fit a line to the logarithm of deviations between trajectories; return their growth factor per step."""
+    """Return the growth factor per step of deviations between trajectories, from a linear fit."""
     tail = np.array(position[len(position) // 2 :])
     if len(tail) < 3 or not (tail > 0).all():
         return 1.0
@@ -463,11 +463,10 @@ PLACES, ATOMS = 8, 32  # places at random, and atoms nearest to each whose energ
 def neighborhoods(
     atoms: Atoms, reach: float, *, places: int = PLACES, count: int = ATOMS, seed: int = 0
 ) -> Iterator[tuple[Atoms, Int[ndarray, "chosen"]]]:
-    """Yield nonperiodic clusters at random positions: a group of atoms, and all atoms within `reach` of it.
+    """Yield clusters of the structure. Each has a group of atoms and all atoms within `reach`.
 
-    For a pair potential with range `reach`, the atoms of the group have the same energies and forces in the
-    cluster as in the whole system. Neighbors are found from distances between atoms and images, without
-    mdnum's cell lists.
+    For a pair potential with range `reach`, the group has the same energies and forces as in the whole
+    system. Neighbors are found from distances between atoms and images, without mdnum's cell lists.
 
     Args:
         atoms: the whole system, with any cell; coordinates may lie outside the cell.

@@ -1,4 +1,4 @@
-"""Tables that can be sorted, searched and paged in the browser, and that are readable without a script."""
+"""Tables that can be sorted, searched and paged in the browser. They are readable without a script."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ class Column:
 
     @property
     def plain(self) -> list[list[Any]]:
-        """Values of the column as lists of plain values, with None in place of values that are not finite."""
+        """Values of the column as lists of plain values. None replaces values that are not finite."""
         if self.kind == "pair":
             return [np.asarray(values).astype(int).tolist() for values in self.of]
         values = np.asarray(self.of)
@@ -55,7 +55,7 @@ class Column:
         return [[float(f"{x:.{kept}g}") if np.isfinite(x) else None for x in values.astype(float).tolist()]]
 
     def text(self, row: Sequence[Any], at: int) -> str:
-        """Return the text of a table cell, given its row and the index of its value in the row."""
+        """Return the text of a table cell, from its row and the index of its value."""
         value = row[at]
         if self.kind == "pair":
             return f"{value}–{row[at + 1]}"
@@ -70,7 +70,7 @@ class Column:
 
 @dataclass(frozen=True)
 class Browse:
-    """A table that can be sorted, searched and paged in the browser, and is readable without a script."""
+    """A table that can be sorted, searched and paged in the browser."""
 
     name: str  # id of the table
     noun: str  # what is searched, in the plural
@@ -79,13 +79,13 @@ class Browse:
 
     @cached_property
     def placed(self) -> list[tuple[int, Column]]:
-        """Columns of the table, each with the index of its value in a row."""
+        """Columns of the table, each with its index in a row."""
         places = np.cumsum([0, *(1 + (column.kind == "pair") for column in self.columns)]).tolist()
         return list(zip(places, self.columns, strict=False))
 
     @cached_property
     def rows(self) -> list[list[Any]]:
-        """Rows of the table as plain values, with None in place of unknown values."""
+        """Rows of the table as plain values. None replaces unknown values."""
         return [list(row) for row in zip(*(each for one in self.columns for each in one.plain), strict=True)]
 
     def is_ambiguous(self, row: Sequence[Any]) -> bool:
@@ -112,7 +112,7 @@ class Browse:
 
     @property
     def spec(self) -> Markup:
-        """Description of the table for the script on the page, as JSON for a script element."""
+        """Description of the table in JSON, for the script on the page."""
         columns = [
             {
                 "at": at, "kind": "number" if one.kind == "ratio" else one.kind, "digits": one.digits,
@@ -129,5 +129,5 @@ class Browse:
 
 
 def _script_safe(value: Any) -> Markup:
-    """Return JSON text for a script element, in which "</script>" inside a string is made harmless."""
+    """Return JSON text in which "</script>" is harmless."""
     return Markup(json.dumps(value, separators=(",", ":"), allow_nan=False).replace("<", "\\u003c"))

@@ -1,6 +1,6 @@
-"""Findings of all commands, the sentences that describe findings, and the verdict that summarizes findings.
+"""Findings of all commands, their sentences and their verdict.
 
-Each command's module determines codes and values of findings; a text file (.toml) contains their sentences.
+A module determines the codes and values of its findings. A text file (.toml) contains the sentences.
 `mdnum/verbs/__init__.toml` explains the format of these text files and of fields in sentences.
 """
 
@@ -93,7 +93,7 @@ class Texts:
         cause: str = "",
         **values: Any,
     ) -> Finding:
-        """Return the finding with a given code, and insert values into the fields of its sentences.
+        """Return the finding with a given code. Values fill the fields of its sentences.
 
         Args:
             variants: alternatives to title, text and remedy, and further sentences (see the module).
@@ -121,7 +121,7 @@ class Texts:
         )  # fmt: skip
 
     def __call__(self, name: str, /, **values: Any) -> str:
-        """Return a sentence from the table [sentences] of the text file; insert values into its fields."""
+        """Return a sentence from the table [sentences]. Values fill its fields."""
         return fill(self.entries["sentences"][name], {"units": self.units, **values})
 
     def plot(
@@ -132,18 +132,18 @@ class Texts:
         horizontals: Iterable[tuple[float, str]] = (),
         **values: Any,
     ) -> Plot:
-        """Return the figure with a given name from the table [plots], and insert values into its texts."""
+        """Return a figure from the table [plots]. Values fill its texts."""
         told: Any = {part: fill(text, values) for part, text in self.entries["plots"][name].items()}
         marks = {"verticals": tuple(verticals), "horizontals": tuple(horizontals)}
         return Plot(name, series=tuple(series), **marks, **told)
 
     def rows(self, table: str, /, **values: Any) -> list[tuple[str, str]]:
-        """Return the rows (name, text) of a table with values inserted; omit rows with a missing value."""
+        """Return the rows (name, text) of a table. Rows with a missing value are omitted."""
         rows = ((_first(name, values), _first(text, values)) for name, text in self.entries[table].items())
         return [(name, text) for name, text in rows if name is not None and text is not None]
 
     def keys(self, table: str = "keys", /, **values: Any) -> list[Key]:
-        """Return a page's key numbers from a table of labels, values and notes; omit missing numbers."""
+        """Return the key numbers of a page. Missing numbers are omitted."""
         keys = []
         for label, texts in self.entries[table].items():
             for value, note in [texts] if isinstance(texts[0], str) else texts:
@@ -160,7 +160,7 @@ class Texts:
         /,
         **values: Any,
     ) -> Browse:
-        """Return the searchable table with a given name from [browse]; omit columns that `rows` lacks.
+        """Return a searchable table from [browse]. Columns that `rows` lacks are omitted.
 
         Args:
             rows: columns of equal length; a column "pair" is made from two of these columns.
@@ -183,13 +183,13 @@ def _plain(value: Any) -> Any:
 
 
 def _first(texts: str | Sequence[str], values: Mapping[str, Any]) -> str | None:
-    """Return the first text that has values for all its fields, with the values inserted; otherwise None."""
+    """Return the first text that has values for all its fields, or None."""
     several = [texts] if isinstance(texts, str) else texts
     return next((fill(text, values) for text in several if _known(text, values)), None)
 
 
 def _known(text: str, values: Mapping[str, Any]) -> bool:
-    """Return True if every field of a text has a value other than None."""
+    """Return True if no field of a text has the value None."""
     names = (name for _, name, _, _ in string.Formatter().parse(text) if name)
     with suppress(TypeError):
         return all(_Fields().get_field(name, (), values)[0] is not None for name in names)
@@ -221,7 +221,7 @@ class Verdict:
         return " ".join((self.headline, *self.evidence))
 
     def judged(self, kind: str, summary: Mapping[str, Any]) -> dict[str, Any]:
-        """Return a summary with verdict and findings; an empty `summary` has the status "unfinished"."""
+        """Add verdict and findings to a summary. An empty `summary` has the status "unfinished"."""
         usual = {"status": "complete" if summary else "unfinished", "seconds": None}
         found = {"headline": self.headline, "findings": plain(self.findings), "verdict": self.text}
         return headed(kind, {**usual, **summary, **found})

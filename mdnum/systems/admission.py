@@ -1,8 +1,8 @@
-"""Classification and validation of a user's energy function by trial calls before the simulation.
+"""Trial calls that classify a user's energy function before the simulation.
 
-The signature of a function does not reveal whether positions are fractional, whether lattice vectors are rows
-or columns, or whether the box is used. With a wrong calling convention, energies can look plausible. The
-function is therefore tested at step 0, with equivalent neighbor lists and slightly different boxes.
+The signature of a function does not show how it uses positions and the box. With a wrong calling convention,
+energies can look plausible. The function is therefore called with equivalent neighbor lists and with slightly
+different boxes.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ _RESOLVED, _BEFORE = 2e-3, 0.03
 
 
 def admitted(simulation: Simulation) -> Simulation:
-    """Classify the energy function of a simulation: find its calling convention and its smoothness.
+    """Find the calling convention and the smoothness of a simulation's energy function.
 
     Raises:
         AdmissionError: the energy function has a defect that is listed in trial.toml.
@@ -53,7 +53,7 @@ def admitted(simulation: Simulation) -> Simulation:
 
 
 def _of_a_part(simulation: Simulation) -> Trial | None:
-    """Classify the energy function on a few atoms of a large structure; return None if the function fails."""
+    """Classify the energy function on a few atoms of a large structure. None if the function fails."""
     if simulation.atoms <= _ENOUGH or simulation.model.start is not None:
         return None
     try:
@@ -77,7 +77,7 @@ def _short(values: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def _examine(trial: Trial) -> None:
-    """Classify the energy function; raise an AdmissionError if its energies or forces cannot be correct."""
+    """Classify the energy function. Raise an AdmissionError if energies or forces are wrong."""
     _resolve(trial)
     _check(trial)
     _at_the_cutoff(trial)
@@ -87,7 +87,7 @@ def _examine(trial: Trial) -> None:
 
 
 def _resolve(trial: Trial) -> None:
-    """Find which box argument the energy function uses, and whether its positions are real or fractional."""
+    """Find the function's box argument, and whether its positions are fractional."""
     how = trial.call.how
     words = ("cell",) if how.native else how.keywords
     paired, periodic = ((trial.inside < trial.n).any(), trial.pbc.any())
@@ -115,7 +115,7 @@ def _resolve(trial: Trial) -> None:
 
 
 def _keep(trial: Trial, box: str) -> None:
-    """Store how the energy function uses the box, and which keywords it needs; energies must be finite."""
+    """Store which keywords the energy function needs. Its energies must be finite."""
     how = trial.call.how
     trial.learn(box=box)
     energy, forces = trial.there()
@@ -139,9 +139,9 @@ def _keep(trial: Trial, box: str) -> None:
 
 
 class _Moved:
-    """Energy changes when the atom with the most neighbors is displaced by lattice vectors.
+    """Energy changes when one atom is displaced by lattice vectors.
 
-    Energies in the sheared box include only atom pairs with the nearest image of the original box.
+    The atom with the most neighbors is displaced. Pairs keep the nearest image of the original box.
     """
 
     def __init__(self, trial: Trial):
@@ -156,12 +156,12 @@ class _Moved:
         self.whole = np.where(whole, near, n).astype(np.int32)
 
     def by(self, vectors) -> list[Float[np.ndarray, "atoms 3"]]:
-        """Return positions with one atom moved by each vector in turn, and the original positions."""
+        """Return positions with one atom moved by each vector. The last are the original positions."""
         x, moved = self.trial.x, np.arange(self.trial.n) == self.central
         return [*(x + np.outer(moved, vector) for vector in vectors[self.trial.pbc]), x]
 
     def takes_images(self) -> bool:
-        """Return True if moving an atom by a lattice vector of the box leaves the energy unchanged."""
+        """Return True if moving an atom by a lattice vector does not change the energy."""
         if not self.unchanged(self.trial.cell):
             return False
         # of a fractional function units are lattice vectors, and perhaps these are whole numbers of units
@@ -169,7 +169,7 @@ class _Moved:
         return call.how.fractional or not self.unchanged(np.eye(3) * call.length)
 
     def unchanged(self, vectors, cell=None) -> bool:
-        """Return True if moving one atom by any of the given vectors leaves the energy unchanged."""
+        """Return True if moving one atom by any of the vectors does not change the energy."""
         trial, idx = self.trial, self.idx
         none = np.nan_to_num(trial.energy(idx=np.full_like(idx, trial.n)))
         *moved, x = self.by(vectors)
@@ -179,7 +179,7 @@ class _Moved:
         return all(abs(trial.energy(x, idx, cell) - energy) <= allowed for x in moved)
 
     def follows(self) -> bool:
-        """Return True if moving an atom by a lattice vector of a sheared box leaves the energy unchanged."""
+        """Return True if the energy of a sheared box has the periodicity of the sheared box."""
         trial = self.trial
         cell = trial.cell + trial.cell @ _SHEAR
         energy, push = trial.energy(idx=self.whole), np.abs(trial.there(idx=self.whole)[1]).max()
@@ -192,7 +192,7 @@ class _Moved:
 
 
 def _check(trial: Trial) -> None:
-    """Raise an error if energies or forces cannot be correct; add notes about the function's properties."""
+    """Raise an error if energies or forces are wrong. Note properties of the function."""
     n, rng, inside = trial.n, np.random.default_rng(0), trial.inside
     energy, wide = trial.there()[0], trial.energy()
 
@@ -238,12 +238,12 @@ def _check(trial: Trial) -> None:
 
 
 def _over_both_lists(trial: Trial) -> dict[str, float]:
-    """Compute the energy twice: for the pairs inside the cutoff, and for all pairs of the neighbor list."""
+    """Return the energy of the pairs inside the cutoff, and of all listed pairs."""
     return {"inside": trial.energy(), "skin": trial.energy(idx=trial.idx)}
 
 
 def _derivatives(trial: Trial, rng: np.random.Generator) -> None:
-    """Compare forces (and the stress, if the function uses the box) with finite differences of the energy."""
+    """Compare forces and stress with finite differences of the energy."""
     step, allowed = (1e-5, 1e-4) if trial.double else (3e-3, 5e-2)
     r_cut = trial.model.r_cut
     step *= r_cut
@@ -291,7 +291,7 @@ def _derivatives(trial: Trial, rng: np.random.Generator) -> None:
 
 
 def _at_the_cutoff(trial: Trial) -> None:
-    """Find the jumps of energy and force when a pair crosses the cutoff, and the range of the forces."""
+    """Find the range of the forces. Find the jumps of energy and force at the cutoff."""
     n, r_cut, size = trial.n, trial.model.r_cut, trial.scale
     r = np.where(trial.idx < n, trial.distances(trial.idx, trial.x), np.inf)
     found, acts = [], []
@@ -303,7 +303,7 @@ def _at_the_cutoff(trial: Trial) -> None:
         toward = np.concatenate(displacement(trial.box, trial.x[[i]], trial.x[[j]])) / r[i, slot]
 
         def crossing(factor: float, i=i, j=j, toward=toward, r=r[i, slot]) -> tuple[float, float]:
-            """Return a pair's contribution to the energy, and the largest component of its force."""
+            """Return the energy of a pair, and the largest component of its force."""
             x = trial.x.copy()
             x[j] += toward * (r_cut * factor - r)
             listed = trial.within(trial.idx, x, r_cut)
@@ -372,7 +372,7 @@ def _threes(trial: Trial) -> tuple[Any, Any, np.ndarray]:
 
 
 def _adds(trial: Trial) -> bool:
-    """Return True if the energies of two separate groups of atoms add up to the energy of both together."""
+    """Return True if the energies of two separate groups of atoms add up."""
     listed, placed, third = _threes(trial)
     if len(third) < 2:
         return True
@@ -385,7 +385,7 @@ def _adds(trial: Trial) -> bool:
 def _reach(trial: Trial) -> tuple[float | None, float]:
     """Return the largest distance at which neighbors exert forces, and the largest distance tested.
 
-    The first returned value is None if there is no force at any tested distance.
+    The first value is None if no tested distance has a force.
     """
     r_cut, (listed, placed, third) = trial.model.r_cut, _threes(trial)
     furthest = min(2 * r_cut, 0.49 * trial.width if trial.pbc.any() else np.inf)
@@ -408,7 +408,7 @@ def _reach(trial: Trial) -> tuple[float | None, float]:
 
 
 def second_derivative(simulation: Simulation) -> str:
-    """Return the first operation with infinite or NaN second derivatives; "" if all are finite."""
+    """Return the first operation with infinite or NaN second derivatives. "" if there is none."""
     if not isinstance(simulation.model, EnergyFunction):
         return ""
     with jaxmd.standard_promotion():

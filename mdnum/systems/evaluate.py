@@ -1,4 +1,4 @@
-"""Energies and forces of single configurations, with a Verlet list that is rebuilt only when necessary."""
+"""Energies and forces of single configurations."""
 
 from __future__ import annotations
 
@@ -59,7 +59,7 @@ class Evaluation:
 
 
 class Evaluator:
-    """Energies and forces of successive configurations; the Verlet list is rebuilt when its skin is used up.
+    """Energies and forces of configurations. The Verlet list is rebuilt when its skin is used up.
 
     Args:
         simulation: the system as objects.
@@ -119,7 +119,7 @@ class Evaluator:
         return float(energy), found
 
     def _sorted(self, positions, cell) -> tuple[Simulation, np.ndarray, PairTable, Tables, jax.Array]:
-        """Return the simulation in a cell, its neighbor list, and positions in the order of the list."""
+        """Return the simulation in a cell, its neighbor list, and the sorted positions."""
         check_not_forked()
         own = self.simulation
         same_box = cell is None or np.array_equal(cell, np.asarray(own.cell.matrix))
@@ -131,7 +131,7 @@ class Evaluator:
         return here, wrapped, table, tables, jax.device_put(x)
 
     def _list(self, here: Simulation, wrapped) -> tuple[PairTable, Tables]:
-        """Return the neighbor list, which is rebuilt if pairs inside the cutoff could be missing."""
+        """Return the neighbor list. It is rebuilt if pairs could be missing."""
         if self._kept is not None:
             table, tables, reference, reference_cell = self._kept
             if self._verlet.consumed(wrapped, here.cell, reference, reference_cell) <= 1.0:
@@ -147,7 +147,7 @@ class Evaluator:
 
 
 def _listed(force: PairForce | ManyBodyForce, x, tables: Tables, stress: bool) -> Any:
-    """Compute forces and the pairs inside the cutoff; if `stress` is True, also compute the virial tensor."""
+    """Compute forces, the pairs inside the cutoff and, if `stress` is True, the virial tensor."""
     return force(x, tables, decisions=True, tensor=stress)
 
 

@@ -1,7 +1,7 @@
-"""Base class of all trajectory readers, which provide the requested frames and properties of the atoms.
+"""Base class of all trajectory readers. Readers provide frames and properties of atoms.
 
 Positions are those of the file, without wrapping, unwrapping or centering. The readers of ASE and mdnum (gro,
-LAMMPS's text dumps) keep every digit; the readers of MDAnalysis reduce coordinates to float32
+LAMMPS's text dumps) keep every digit. The readers of MDAnalysis reduce coordinates to float32
 (`Trajectory.bits`).
 """
 
@@ -28,10 +28,10 @@ SAMPLE = 8
 
 
 class Trajectory(ABC):
-    """Frames of one file, which can be read in order any number of times; each frame is read when needed.
+    """Frames of one file. They can be read any number of times, in order.
 
-    A subclass sets the number of atoms (`has_atoms`), reads raw frames (`raw_frames`) and decodes raw frames
-    (`decoded`). An exception in a method of a subclass is reported as an unreadable frame.
+    A subclass defines `has_atoms`, `raw_frames` and `decoded`. An exception in these methods is reported as
+    an unreadable frame.
 
     Args:
         path: the trajectory file.
@@ -96,12 +96,12 @@ class Trajectory(ABC):
         return self.table.species
 
     def other_box(self, number: int) -> tuple[str, Box] | None:
-        """Return (code of a finding, another possible box of a frame); None if only one box is possible."""
+        """Return (code of a finding, second possible box of a frame). None if only one box is possible."""
         return None
 
     @property
     def in_file(self) -> int | None:
-        """Number of frames in the file; None if unknown before the file has been read."""
+        """Number of frames in the file. None if still unknown."""
         if self._count is None and any((end or 0) < 0 for end in (self.slice.start, self.slice.stop)):
             with self._opened() as get:
                 for number in chosen(slice(None), None):
@@ -113,11 +113,11 @@ class Trajectory(ABC):
 
     @property
     def count(self) -> int | None:
-        """Number of frames that `frames` yields; None if unknown before the file has been read."""
+        """Number of frames that `frames` yields. None if still unknown."""
         return None if self.in_file is None else len(range(*self.slice.indices(self.in_file)))
 
     def frames(self) -> Iterator[Frame]:
-        """Yield the requested frames one by one, in order; each call begins at the first frame.
+        """Yield the requested frames in order. Each call starts at the first frame.
 
         Raises:
             UnreadableFrame: a frame cannot be read; all earlier frames have been yielded.
@@ -143,7 +143,7 @@ class Trajectory(ABC):
                 raise self._unreadable(end, rest)
 
     def sample(self) -> list[Frame]:
-        """Return the first `SAMPLE` requested frames, or fewer if one of these frames is unreadable.
+        """Return the first `SAMPLE` requested frames. Fewer if one of them is unreadable.
 
         Raises:
             InputError: there is no frame, or the first frame cannot be read.
@@ -161,7 +161,7 @@ class Trajectory(ABC):
 
     @property
     def slice_words(self) -> str:
-        """Requested frames in the notation used after @ in a file name; empty for all frames."""
+        """Requested frames as written after @ in a file name. Empty for all frames."""
         if self.slice == slice(None):
             return ""
         start, stop, step = self.slice.start, self.slice.stop, self.slice.step
@@ -170,18 +170,18 @@ class Trajectory(ABC):
 
     @abstractmethod
     def raw_frames(self) -> AbstractContextManager[Callable[[int], Any]]:
-        """Open the file, and provide a function that returns raw frames by ascending number, then None."""
+        """Open the file and provide a function that returns raw frames, then None."""
 
     @abstractmethod
     def decoded(self, number: int, raw: Any) -> Frame:
-        """Decode a raw frame returned by `raw_frames`, in the units named by `length` and `time`."""
+        """Decode a raw frame of `raw_frames`. Units are those of `length` and `time`."""
 
     def _behind(self) -> str | None:
-        """Describe data after the last frame of the file; return None if the file ends there."""
+        """Describe data after the last frame of the file. None if there is no such data."""
         return None
 
     def _by_id(self, number: int, ids: np.ndarray) -> np.ndarray:
-        """Return the indices that sort the atoms of a frame by id; ids must be those of the first frame."""
+        """Return the indices that sort the atoms by id. The first frame must have the same ids."""
         order = np.argsort(ids, kind="stable")
         known = self._ids = ids[order] if self._ids is None else self._ids
         if not np.array_equal(known, ids[order]):
@@ -202,7 +202,7 @@ class Trajectory(ABC):
         return reading(self.path, number, by=self.reader)
 
     def in_order(self, following: Callable[[], Any]) -> Callable[[int], Any]:
-        """Return a function that returns frames by ascending number, for a format without random access."""
+        """Return a function that reads frames of a format without random access, in order."""
         at = 0
 
         def get(number: int) -> Any:
@@ -220,7 +220,7 @@ class Trajectory(ABC):
         return get
 
     def first(self) -> Any:
-        """Return the first frame of the file in the raw form that `decoded` accepts."""
+        """Return the first frame of the file in raw form."""
         with self._opened() as get, self._reading(0):
             first = get(0)
         if first is None:
@@ -238,7 +238,7 @@ class Trajectory(ABC):
 
 
 def chosen(frames: slice, total: int | None) -> Iterator[int]:
-    """Return the ascending frame numbers of a slice; the sequence is infinite if no end is known."""
+    """Return the frame numbers of a slice in ascending order. Infinite if no end is known."""
     if total is not None:
         return iter(range(*frames.indices(total)))
     return islice(count(), frames.start, frames.stop, frames.step)

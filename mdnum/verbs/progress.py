@@ -1,4 +1,4 @@
-"""Progress display of a command: a bar in a terminal or a notebook, occasional lines elsewhere."""
+"""Progress display of a command: a bar in a terminal or notebook, otherwise lines of text."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ def reported(progress: Wanted) -> Iterator[Progress | None]:
     """Context manager: yield the function to which progress is reported, or None.
 
     A function `progress` receives the reports. If `progress` is True, a bar is always shown; if False, never.
-    If `progress` is None, no bar is shown in worker processes and in commands called by other commands.
+    If `progress` is None, worker processes and nested commands show no bar.
     """
     from multiprocessing import parent_process
 
@@ -46,10 +46,10 @@ def reported(progress: Wanted) -> Iterator[Progress | None]:
 
 
 class ProgressBar:
-    """Progress bar, called as progress(step, steps, info); shows steps/s, flips, list rebuilds, time left.
+    """Progress bar with steps/s, flips, list rebuilds and time left. Call it as progress(step, steps, info).
 
-    If the unit of progress is not a step, info["unit"] names it. A separate thread draws the bar, because a
-    run begins with seconds of compilation without any reports.
+    If the unit of progress is not a step, info["unit"] names it. A separate thread draws the bar, because
+    compilation sends no reports.
 
     Args:
         stream: where to draw a bar, or to print lines if the stream is no terminal; default stderr, or the
@@ -83,12 +83,12 @@ class ProgressBar:
             self._bar.stop()
 
     def __call__(self, step: int, steps: int, info: dict[str, Any]) -> None:
-        """Receive a progress report: the current step, the number of steps, and further counts."""
+        """Receive a report: the current step, the number of steps, and further counts."""
         self._last = (step, steps, dict(info))
         self.folder = info.get("folder", self.folder)
 
     def _watch(self) -> None:
-        """Draw the bar or print a line, at intervals, until the progress bar is stopped."""
+        """Draw the bar or print a line until the progress bar is stopped."""
         while not self._over.wait(self._pause):
             step, steps, info = self._last
             phase = str(info.get("phase", "run"))
@@ -108,7 +108,7 @@ class ProgressBar:
 
 
 def _drawn(stream: TextIO) -> Any:
-    """Start and return a progress bar, which is shown until its method `stop` is called."""
+    """Start and return a progress bar. Its method `stop` removes it."""
     from rich.console import Console
     from rich.progress import BarColumn, Progress, SpinnerColumn, TextColumn
 
@@ -123,7 +123,7 @@ def _drawn(stream: TextIO) -> Any:
 
 
 class _Cell:
-    """A progress bar below a notebook cell, shown until its method `stop` is called."""
+    """A progress bar below a notebook cell. Its method `stop` removes it."""
 
     def __init__(self, stream: TextIO):
         from IPython.display import display  # pyright: ignore[reportMissingImports]
@@ -141,7 +141,7 @@ class _Cell:
 
 
 def describe(step: int, steps: int, info: dict[str, Any]) -> str:
-    """Format the text next to the progress bar: counts, steps per second and remaining time."""
+    """Format the text next to the bar: counts, steps per second and remaining time."""
     unit = info.get("unit", "steps")
     parts = [f"{step:,} of {steps:,} {unit}"]
     parts += [f"{info[name]:,} {name}" for name in ("flips", "rebuilds") if name in info]

@@ -1,4 +1,4 @@
-"""Convert functions and classes to neighbor lists that can be tested, with declared limits."""
+"""Conversion of functions and classes to neighbor lists that can be tested."""
 
 from __future__ import annotations
 
@@ -19,13 +19,12 @@ from mdnum.registry import Registry
 
 
 class KeptList(Protocol):
-    """A neighbor list that is built once and then updated; for the form of the pairs, see `answer.read`.
+    """A neighbor list that is built and then updated. `answer.read` describes the pairs.
 
-    `allocate` builds a new neighbor list and may be called again on the same object; `update` receives the
-    current positions. The returned pairs must include every pair within r_cut at the current positions, and
-    may include pairs that are farther apart by less than the skin. If a neighbor list uses its own padding
-    instead of the given skin, its attribute `skin` must contain this padding (length). The attribute `skin`
-    is read after each call of `allocate`.
+    `allocate` builds a new neighbor list, also repeatedly. `update` receives the current positions. The pairs
+    must include every pair within r_cut at the current positions. Further pairs may be farther apart by less
+    than the skin. A neighbor list with its own padding must store it in the attribute `skin` (length). The
+    attribute `skin` is read after each call of `allocate`.
     """
 
     def allocate(self, positions: ndarray, cell: ndarray, pbc: ndarray, r_cut: float, skin: float) -> Any:
@@ -35,7 +34,7 @@ class KeptList(Protocol):
     def update(self, positions: ndarray, cell: ndarray) -> Any:
         """Update the neighbor list to new positions and return its pairs.
 
-        The arguments may be the arrays of the previous call with new contents; therefore, store copies.
+        The arguments may be the same arrays with new contents: store copies.
         """
         ...
 
@@ -48,7 +47,7 @@ _WANTED = f"Give a function of ({', '.join(_GIVEN)}) that returns (i, j)"
 
 @dataclass(frozen=True)
 class ListLimits:
-    """Limits on the inputs of a neighbor list; test cases beyond these limits are skipped and counted."""
+    """Limits on the inputs of a neighbor list. Test cases beyond a limit are skipped and counted."""
 
     minimum_image: bool = False  # one image of a pair at most: no cell narrower than two cutoffs (and skins)
     orthorhombic: bool = False  # no cell with other than right angles
@@ -69,11 +68,11 @@ class ListLimits:
     roomy: float = np.inf  # no box of more cells of r_cut than this along all axes together
 
     def refusal(self, case: Case) -> str | None:
-        """Return, as text, the limit that a test case exceeds; None if the test case is within all limits."""
+        """Return the limit that a test case exceeds, as text. None if there is none."""
         return next((why for beyond, why in self._beyond(case) if beyond), None)
 
     def _beyond(self, case: Case) -> Iterator[tuple[bool, str]]:
-        """Yield, for each limit, whether a test case exceeds it, and the limit's name; cheap checks first."""
+        """Yield for each limit whether a test case exceeds it, and its name."""
         pbc, cells = np.array(case.pbc), [still.cell for still in case.stills]
         least = min(len(still.positions) for still in case.stills)
         yield least < self.atoms, f"at least {self.atoms} atom{'s' * (self.atoms > 1)}"
@@ -139,7 +138,7 @@ class PairList:
 
     @property
     def version(self) -> str | None:
-        """Installed version of the package of the neighbor list; None if it is not known."""
+        """Installed version of the neighbor list's package. None if unknown."""
         return self.package and version(self.package)
 
     @property
@@ -159,7 +158,7 @@ LISTS: Registry[PairList] = Registry("neighbor list", "mdnum.neighbor_lists")
 
 
 def source_of(made: Any) -> str:
-    """Return the source code of a function or class, without its decorators; "" if it is not available."""
+    """Return the source code of a function or class without decorators. "" if not available."""
     try:
         lines = inspect.getsource(made).splitlines(keepends=True)
     except (OSError, TypeError):
@@ -169,10 +168,10 @@ def source_of(made: Any) -> str:
 
 
 def from_object(made: Any, name: str | None = None, source: str | None = None) -> PairList:
-    """Return a `PairList` made from a function, a class of updatable lists, or an updatable list.
+    """Return a `PairList` made from a function, a class or an object.
 
-    The properties of the neighbor list are read from the attributes `full` (bool), `unit` (roundoff),
-    `superset` (bool) and `limits` (`ListLimits`) of the object, if present.
+    The optional attributes `full` (bool), `unit` (roundoff), `superset` (bool) and `limits` (`ListLimits`) of
+    the object describe the list.
 
     Raises:
         InputError: the object is neither a function nor a neighbor list.
@@ -204,7 +203,7 @@ def from_object(made: Any, name: str | None = None, source: str | None = None) -
 
 
 def _check_signatures(made: Any, name: str, kept: bool) -> None:
-    """Raise InputError if the signature of a neighbor list does not accept the suite's arguments."""
+    """Raise InputError if a neighbor list does not accept the arguments of the tests."""
     is_class = inspect.isclass(made)
     calls: list[tuple[str, Any, tuple[str, ...]]] = []
     if is_class or not kept:
