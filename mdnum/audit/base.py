@@ -1,4 +1,4 @@
-"""Base class `AuditCheck` of calculator checks, their results and findings, and limits on calls and time."""
+"""Base class of calculator checks, their results, and limits on calls and time."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ def idle(done: int, total: int, info: dict[str, Any]) -> None:
 
 
 class CallsUp(TimeUp):
-    """Raised when a check has reached its limit on calculator calls; the check then ends unfinished."""
+    """Raised when a check has reached its limit on calculator calls."""
 
     why = "the calls of this check were used up"
 
@@ -55,10 +55,9 @@ class CalculatorError(MdnumError):
 
 @dataclass
 class Meter:
-    """Counts the calls to a calculator, and enforces limits on the number of calls and on the elapsed time.
+    """Counts the calls to a calculator, and limits calls and time.
 
-    The number of calculator calls of each check is limited, so that results do not depend on the load of the
-    machine. A deadline can end a check before the limit on its calls is reached.
+    Limits on calls make results independent of the load of the machine. A deadline can end a check earlier.
     """
 
     calls: int = 0
@@ -79,12 +78,12 @@ class Meter:
 
     @property
     def up(self) -> type[TimeUp] | None:
-        """Error class if a limit is reached (`TimeUp`: deadline, `CallsUp`: calculator calls), or None."""
+        """Error class if a limit is reached (`TimeUp` or `CallsUp`), or None."""
         return TimeUp if self.deadline.passed else CallsUp if self.calls >= self.most else None
 
     @contextmanager
     def apart(self, calls: int) -> Iterator[None]:
-        """Allow calculator calls beyond the limit of a check, to compute a result that several checks use."""
+        """Allow extra calculator calls for a result that several checks use."""
         most = self.most
         self.most = self.calls + calls
         try:
@@ -94,7 +93,7 @@ class Meter:
 
     @contextmanager
     def limited(self) -> Iterator[None]:
-        """Limit calculator calls and time in a `with` block; a call beyond a limit raises `TimeUp`."""
+        """Limit calculator calls and time in a `with` block. Beyond a limit, `TimeUp` is raised."""
         if up := self.up:
             raise up
         self._limited += 1
@@ -106,7 +105,7 @@ class Meter:
 
 @dataclass(frozen=True)
 class Observed:
-    """One finding of a check: a code, and the values that are inserted into the text for this code."""
+    """One finding of a check: a code, and the values for its text."""
 
     code: str  # short stable name
     severity: Severity  # info (nothing to do), warning (look at it), error (the numbers are wrong)
@@ -118,7 +117,7 @@ class Observed:
 def finding(
     code: str, severity: Severity, *variants: str | None, tests: Collection[str] = (), **values: Any
 ) -> Observed:
-    """Return a finding whose text combines the given text variants; a variant that is None is left out.
+    """Return a finding. Text variants that are None are left out.
 
     Args:
         tests: names (keys of `causes.TESTS`) of the tests that were made and that leave this cause possible.
@@ -136,7 +135,7 @@ def finding(
 
 @dataclass(frozen=True)
 class Chart:
-    """A chart of labeled lines over a common x axis; marks on this axis show, for example, thresholds."""
+    """A chart of labeled lines, with marks on the x axis."""
 
     title: str
     x_label: str
@@ -169,11 +168,10 @@ class CheckResult:
 
 
 class AuditCheck:
-    """Base class of calculator checks; each subclass is one check, in `mdnum.audit.checks` or in a plugin.
+    """Base class of calculator checks. Each subclass is one check.
 
-    A subclass defines a name, a title, a one-line docstring and the method `ask`. The texts of a check's
-    findings are in mdnum/verbs/audit.toml, under the codes of the findings. To add a check, add the file
-    `checks/NAME.py` with the class `NameCheck`.
+    A subclass defines a name, a title, a one-line docstring and the method `ask`. The texts of findings are
+    in mdnum/verbs/audit.toml. To add a check, add the file `checks/NAME.py` with the class `NameCheck`.
 
     Args:
         timestep: time step of a run, internal time; None for a fraction of the fastest vibration's period.
@@ -213,7 +211,7 @@ class AuditCheck:
         raise NotImplementedError
 
     def __call__(self, subject: CalculatorSubject, progress: Progress | None = None) -> CheckResult:
-        """Run the check; return its result together with its name, its title and the elapsed time."""
+        """Run the check, and return its result with name, title and time."""
         began, meter = perf_counter(), subject.meter
         meter.most = meter.calls + self.calls + (0 if self.brief else meter.spare)
         try:
@@ -226,7 +224,7 @@ class AuditCheck:
 
 
 def _above_limits(result: CheckResult) -> Iterator[Observed]:
-    """Yield a finding for each result above its limit that the check itself has not reported."""
+    """Yield a finding for each unreported result above its limit."""
     codes = {one.code for one in result.findings}
     for name, (limit, reports) in result.limits.items():
         value = result.numbers.get(name)
@@ -263,7 +261,7 @@ class Ways:
         tolerant: bool = False,
         most: int | None = None,
     ) -> dict[int, T]:
-        """Call the function `ask` for each item until the deadline; return the results by item index.
+        """Call `ask` for each item until the deadline. Return results by index.
 
         Args:
             subject: calculator whose limits on calls and time apply.

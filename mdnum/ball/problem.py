@@ -21,10 +21,10 @@ START = ("y0", "v0")  # parameters of the start rather than of the world; a valu
 
 
 class BallLoss(Protocol):
-    """Protocol of a loss of a bouncing-ball simulation: a sum over time steps and a final term."""
+    """Protocol of a ball's loss: a sum over steps and a final term."""
 
     def step(self, state: BallState, record: BallRecord, dtype: Any) -> Float[Array, ""]:
-        """Return how much the time step that ended in the given state contributes to the loss."""
+        """Return the contribution of one time step to the loss."""
         ...
 
     def end(self, state: BallState, steps: int, total: Float[Array, ""]) -> Float[Array, ""]:
@@ -33,7 +33,7 @@ class BallLoss(Protocol):
 
 
 class FinalHeight(eqx.Module):
-    """Loss: the mean final height (m), or the mean squared distance from a target height (m²)."""
+    """Loss: the mean final height (m), or the mean squared distance from a target (m²)."""
 
     target: float | None = eqx.field(static=True, default=None)
 
@@ -42,7 +42,7 @@ class FinalHeight(eqx.Module):
         return jnp.zeros((), dtype)
 
     def end(self, state, steps, total):
-        """Return the mean final height, or the mean squared distance from the target height."""
+        """Return the mean final height, or the mean squared distance from the target."""
         y = state.y.astype(total.dtype)
         if self.target is None:
             return jnp.mean(y, dtype=total.dtype)
@@ -57,17 +57,17 @@ class MeanHeight(eqx.Module):
         return jnp.mean(state.y.astype(dtype), dtype=dtype)
 
     def end(self, state, steps, total):
-        """Return the loss: the sum over time steps divided by the number of steps."""
+        """Return the sum over steps divided by the number of steps."""
         return total / max(steps, 1)
 
 
 class ResidualPenetration(eqx.Module):
-    """Loss: the penetration that remains after each step, summed over steps and averaged over balls."""
+    """Loss: the penetration that remains after each step, summed over steps."""
 
     power: int = eqx.field(static=True, default=2)  # 2 for squares, m²; 1 for the penetration itself, m
 
     def step(self, state, record, dtype):
-        """Return the mean of |p|^power over all balls, where p is the remaining penetration."""
+        """Return the mean of |penetration|^power over all balls."""
         left = record.left.astype(dtype)
         return jnp.mean(left if self.power == 1 else left**self.power, dtype=dtype)
 
@@ -78,7 +78,7 @@ class ResidualPenetration(eqx.Module):
 
 @dataclass(frozen=True)
 class BallProblem:
-    """A differentiable bouncing-ball problem: a model, initial heights and velocities, steps and a loss."""
+    """A differentiable bouncing-ball problem."""
 
     world: World  # the program
     y0: Any  # heights at the start, m, a number or shape (balls,)
@@ -106,7 +106,7 @@ class BallProblem:
     def value(
         self, overrides: Mapping[str, Any] | None = None, imposed: BallDecisions | None = None
     ) -> float:
-        """Compute the loss, optionally with other parameter values, which do not need another compilation.
+        """Compute the loss. Other parameter values need no new compilation.
 
         Args:
             imposed: decisions of every step (first axis: steps) that replace the model's own decisions.
@@ -115,7 +115,7 @@ class BallProblem:
         return float(_loss(problem.bare, problem.world, *problem.start_arrays, imposed))
 
     def origin(self, names: Sequence[str]) -> dict[str, Array]:
-        """Return the arguments at which `loss_at` is differentiated: parameter values, and 0 for y0 and v0.
+        """Return the arguments of `loss_at`: parameter values, and 0 for y0 and v0.
 
         Raises:
             InputError: a parameter does not exist.
@@ -128,7 +128,7 @@ class BallProblem:
     def value_and_grad(
         self, names: Sequence[str], imposed: BallDecisions | None = None, scale: float = 1.0
     ) -> tuple[float, dict[str, float]]:
-        """Compute the loss and its derivatives with respect to parameters, through all solver iterations.
+        """Compute the loss and its derivatives through all solver iterations.
 
         Args:
             names: names of parameters; y0 and v0 are common displacements of all balls.
@@ -168,7 +168,7 @@ def loss_of(
     loss: BallLoss,
     imposed: BallDecisions | None = None,
 ) -> Float[Array, ""]:
-    """Compute the loss of a simulation, differentiable in all arguments except the steps and the loss.
+    """Compute the loss of a simulation as a differentiable function.
 
     Args:
         imposed: decisions of every step (first axis: steps) to impose; None for the model's own decisions.
@@ -189,7 +189,7 @@ def loss_of(
 
 
 def loss_at(bare, world, y0, v0, values, imposed):
-    """Compute the loss for given parameter values, all of which are arguments of the compiled function.
+    """Compute the loss for given values of the parameters.
 
     Args:
         bare: number of steps, and loss.
@@ -214,9 +214,9 @@ def _value_and_grad(bare, values, world, y0, v0, imposed, scale):
 
 
 def arrive(world: World, y0: Float[Array, "balls"], steps: int, name: str) -> tuple[Array, Array]:
-    """Compute final heights and their derivatives with respect to one parameter, in forward mode.
+    """Compute final heights and their derivatives with respect to one parameter.
 
-    The function is compiled only once, because the time step and the number of steps are arguments.
+    The function is compiled only once.
     """
     return _arrive(world, y0, jnp.asarray(steps), name)
 

@@ -1,10 +1,9 @@
-"""Compute derivatives of averages from the frames of one run, without differentiating its dynamics.
+"""Derivatives of averages, from frames alone. The dynamics is not differentiated.
 
-The derivative of an average with respect to a parameter has up to three contributions. First, at fixed
-positions, the value of the observable in each frame changes. Second, if the observable jumps when a pair
-enters the cutoff, the average changes with the cutoff radius. This contribution is the height of the jump
-times the density of pairs at the cutoff. Derivatives at fixed decisions omit this contribution. Third, with a
-thermostat, the statistical weight exp(-U/kT) of each frame changes.
+The derivative of an average has up to three contributions. First, at fixed positions, the value of the
+observable in each frame changes. Second, an observable may jump when a pair enters the cutoff. This
+contribution is the jump times the density of pairs at the cutoff. Derivatives at fixed decisions omit this
+contribution. Third, with a thermostat, the statistical weight exp(-U/kT) of each frame changes.
 """
 
 from __future__ import annotations
@@ -38,7 +37,7 @@ WIDTHS = 5
 
 @dataclass(frozen=True)
 class Frames:
-    """Frames of a run that contribute to the loss, with the loss, energies and derivatives of each frame."""
+    """Frames of a run, with the loss, energy and derivatives of each."""
 
     step: Int[np.ndarray, "frames"]  # of each
     x: Float[np.ndarray, "frames 3 atoms"]  # wrapped positions, user's order, length
@@ -57,12 +56,12 @@ class Frames:
 
 
 def known(name: str) -> bool:
-    """Return whether the energy of a frame can depend on a parameter at fixed positions."""
+    """Return whether the energy can depend on a parameter at fixed positions."""
     return name.startswith(("potential.", "cutoff.")) or name == "box.scale"
 
 
 def frames(tape: RunTape, names: Sequence[str], progress: Callable[[int, int], None] | None = None) -> Frames:
-    """Evaluate the loss and its derivatives with respect to parameters in each frame of a recorded run.
+    """Evaluate the loss and its derivatives in each frame of a run.
 
     Args:
         tape: the run, of a pair potential.
@@ -154,7 +153,7 @@ def _look(forces: tuple[PairForce, PairForce], tables, rows, bits, seen, looking
 
 
 def standard_error(series: Float[np.ndarray, "frames"]) -> float:
-    """Return the largest standard error of the mean of a correlated series, for 8, 16 and 32 blocks.
+    """Return the standard error of a correlated series, the largest for 8, 16 and 32 blocks.
 
     Source: H. Flyvbjerg, H. G. Petersen, J. Chem. Phys. 91, 461 (1989).
     """
@@ -170,7 +169,7 @@ def standard_error(series: Float[np.ndarray, "frames"]) -> float:
 
 @dataclass(frozen=True)
 class Density:
-    """Weighted number of pairs per unit of distance at the cutoff, and the error of this number."""
+    """Number of pairs per unit of distance at the cutoff, and its error."""
 
     # each frame's share of the estimate that was chosen, shape (frames, types)
     frames: Float[np.ndarray, "frames types"]
@@ -184,7 +183,7 @@ class Density:
 def distances(
     simulation: Simulation, x: Float[np.ndarray, "3 atoms"], reach: float
 ) -> list[Float[np.ndarray, "pairs"]]:
-    """Return r - r_cut of all pairs with |r - r_cut| < reach, in one array per pair type.
+    """Return r - r_cut of pairs near the cutoff, in one array per pair type.
 
     Args:
         x: wrapped positions.
@@ -206,12 +205,12 @@ def density(
     reach: float,
     progress: Callable[[int, int], None] | None = None,
 ) -> Density:
-    """Estimate the weighted sum of the pair density at the cutoff, delta(r_cut - r_ij), over all frames.
+    """Estimate the weighted pair density at the cutoff, summed over frames.
 
     The delta function is replaced by a parabolic kernel of finite width. The bias contains only even powers
     of the width. Extrapolation from three widths (w, w/2, w/4) removes the second and fourth powers. The
-    result is the extrapolation from the widest kernels that agrees with those from all narrower kernels. Two
-    extrapolations agree if they differ by at most twice the standard error of their difference.
+    result uses the widest kernels that agree with all narrower ones. Results agree if they differ by at most
+    two standard errors.
 
     Args:
         weights: one per frame and pair type. reach: the largest width, length.
@@ -249,7 +248,7 @@ def density(
 
 @dataclass(frozen=True)
 class BoundaryTerm(Method):
-    """Gradient method: derivative of an average over given states, including pairs that cross the cutoff."""
+    """Gradient method: derivative of an average, including pairs that cross the cutoff."""
 
     # half the width of the widest kernel as a share of the cutoff; less where the box is narrow
     reach: float = 0.1
@@ -285,7 +284,7 @@ class BoundaryTerm(Method):
         return self.result(tape.value, gradient, details={"frames": len(seen), **details})
 
     def terms(self, simulation: Simulation, seen: Frames, names: Sequence[str], progress=None):
-        """Return the contribution of each frame to each derivative, and a dictionary with errors."""
+        """Return the contribution of each frame to each derivative, and the errors."""
         energy, force = simulation.jumps()
         radii = np.asarray(simulation.decider.r_cut)
         # what a pair that enters adds to the loss of each frame
@@ -319,12 +318,12 @@ class BoundaryTerm(Method):
 class Reweighting(Method):
     """Gradient method: differentiable trajectory reweighting, for averages over a canonical ensemble.
 
-    The derivative is the explicit derivative of the loss (see `BoundaryTerm`) minus cov(loss, dU/dp) / kT,
-    where U is the energy and p the parameter. The covariance describes how the weights of the frames change.
+    The derivative is the explicit derivative of the loss minus cov(loss, dU/dp) / kT, for energy U and
+    parameter p. The covariance describes how the weights of the frames change.
 
     Error: the error is statistical; `details` contains a standard error from block averages. The standard
-    error is large for few independent frames, and it covers only fluctuations within one run. Source: Thaler
-    and Zavadlav, Nature Communications 12, 6884 (2021).
+    error covers only fluctuations within one run. Source: Thaler and Zavadlav, Nature Communications 12, 6884
+    (2021).
     """
 
     at_states: BoundaryTerm = field(default_factory=BoundaryTerm)  # the explicit part
@@ -378,7 +377,7 @@ class Reweighting(Method):
 
 
 def _score(simulation: Simulation, seen: Frames, name: str) -> Float[np.ndarray, "frames *types"]:
-    """Return d ln(weight)/d(parameter) for each frame, where the weight is that of a canonical ensemble."""
+    """Return d ln(weight)/d(parameter) for each frame, in a canonical ensemble."""
     bath = simulation.integrator
     kT = float(getattr(bath, bath.keys()["temperature"].name))
     if name == "dynamics.temperature":

@@ -1,4 +1,4 @@
-"""Gradient methods for a ball that treat a contact as a fixed point, a soft floor, or an exact impact."""
+"""Gradient methods for a ball: fixed point, soft floor, or exact impact."""
 
 from __future__ import annotations
 
@@ -37,17 +37,16 @@ _NARROW = 1e-6
 
 
 def _moving(x: Any) -> Any:
-    """Return x minus its value held constant: the result is zero, but has the derivative of x."""
+    """Return zero with the derivative of x."""
     return x - lax.stop_gradient(x)
 
 
 class FixedPointRule(eqx.Module):
-    """Derivative rule for the contact projection: its fixed point is differentiated, not its iterations.
+    """Derivative of the contact's fixed point, not of its iterations.
 
-    For a ball in contact, the iteration y ← G(y) = y + gain max(0, -y) approaches the fixed point y = 0 from
-    below. At y = 0, dG/dy is discontinuous. The rule uses the value for y < 0, because the iteration
-    approaches y = 0 from below. By the implicit function theorem, (1 - dG/dy) dy = dG/dgain dgain, so that
-    gain dy = -y dgain for each ball.
+    For a ball in contact, y ← G(y) = y + gain max(0, -y) approaches 0 from below. At y = 0, dG/dy is
+    discontinuous. The rule therefore uses the value for y < 0. Implicit differentiation, (1 - dG/dy) dy =
+    dG/dgain dgain, gives gain dy = -y dgain for each ball.
     """
 
     # added to 1 - dG/dy; moves the answer by about regularization / gain, relative
@@ -58,7 +57,7 @@ class FixedPointRule(eqx.Module):
     def attach(
         self, y: Float[Array, "balls"], gain: Float[Array, "balls"], contact: Bool[Array, "balls"]
     ) -> Float[Array, "balls"]:
-        """Return the heights y unchanged, but with the derivative of the fixed point of the projection.
+        """Return the heights y, with the derivative of the fixed point.
 
         Args:
             y: heights where the iteration stopped.
@@ -71,19 +70,19 @@ class FixedPointRule(eqx.Module):
 
 
 class _Settled(eqx.Module):
-    """Rule that moves every ball in contact from below the floor up to the floor."""
+    """Rule that moves balls below the floor up to the floor."""
 
     def attach(self, y, gain, contact):
-        """Return the fixed point: 0 for balls in contact below the floor, otherwise y."""
+        """Return 0 for balls in contact below the floor, otherwise y."""
         return jnp.where(contact & (y < 0), jnp.zeros_like(y), y)
 
 
 @dataclass(frozen=True)
 class Implicit(BallMethod):
-    """Gradient method: derivative of the fixed point of the contact projection (implicit function theorem).
+    """Gradient method: derivative of the fixed point of the contact.
 
-    The loss uses the executed iterations, but the derivative is that of their limit, the floor. With respect
-    to the gain k, the method `unrolled` gives a nonzero derivative, an artifact of the tolerance.
+    The loss uses the executed iterations, the derivative their limit. For the gain k, `unrolled` gives a
+    nonzero derivative, an artifact of the tolerance.
     """
 
     regularization: float = 0.0  # added to 1 - dG/dy, for a gain too small to divide by
@@ -139,10 +138,10 @@ def _with_contact(problem: BallProblem, contact: Any) -> BallProblem:
 
 
 class SoftImpact(eqx.Module):
-    """Smooth model of an impact: a soft spring that is stiffer while the ball falls than while it rises.
+    """Smooth model of an impact: a spring that is softer on the rebound.
 
-    The stiffness is k while the ball falls and restitution² k while it rises, with smooth transitions. The
-    ball therefore leaves the floor at `restitution` times its impact speed.
+    The stiffness is k on the way down and restitution² k on the way up. The ball therefore leaves the floor
+    at `restitution` times its impact speed.
 
     Source: latching spring of Walton and Braun (1986), here with smooth transitions.
     """
@@ -153,13 +152,13 @@ class SoftImpact(eqx.Module):
     slow: Any  # in velocity, of the passage, m/s
 
     def acceleration(self, y, v, free, contact, r):
-        """Return the acceleration due to control, gravity and spring; the contact decision is not used."""
+        """Return the acceleration by control, gravity and spring. Contact decisions are not used."""
         depth = self.eps * jax.nn.softplus(-y / self.eps)
         share = self.restitution**2
         return free + self.k * depth * (share + (1 - share) * jax.nn.sigmoid(-v / self.slow))
 
     def move(self, motion: Motion) -> Moved:
-        """Integrate one step with the force of the spring; the contact decision is recorded but not used."""
+        """Integrate one step with the spring. The contact decision is only recorded."""
 
         def pull(y, v, contact):
             return self.acceleration(y, v, motion.free, contact, motion.rounding)
@@ -170,7 +169,7 @@ class SoftImpact(eqx.Module):
 
 @dataclass(frozen=True)
 class SoftFloor(BallMethod):
-    """Gradient method: derivative of a different program, in which the floor is soft (see `softened`)."""
+    """Gradient method: derivative of a program with a soft floor (`softened`)."""
 
     # width, m. Small: near the given program, with derivatives that peak at its contacts. Large: a tame
     # derivative, of something else. None for one that suits the problem: a tenth of the depth to which a
@@ -210,7 +209,7 @@ class SoftFloor(BallMethod):
 
 
 def softened(problem: BallProblem, eps: float) -> BallProblem:
-    """Return the problem with a soft floor: a softplus of width eps or, for impacts, a spring.
+    """Return the problem with a soft floor (a softplus) or, for impacts, a spring.
 
     Raises:
         InputError: the ball would cross the soft floor of width eps in too few steps.
@@ -241,7 +240,7 @@ def softened(problem: BallProblem, eps: float) -> BallProblem:
 
 
 def _speed(problem: BallProblem) -> float:
-    """Return the speed (m/s) at which a ball of this problem reaches the floor; 1 if no ball falls."""
+    """Return the impact speed (m/s) of a ball. 1 if no ball falls."""
     height = max(float(np.max(np.asarray(problem.y0, np.float64))), 0.0)
     square = float(np.max(np.asarray(problem.v0, np.float64) ** 2))
     return float(np.sqrt(square + 2 * abs(float(problem.world.gravity)) * height)) or 1.0
@@ -256,13 +255,13 @@ def _suitable(problem: BallProblem) -> float:
 
 @dataclass(frozen=True)
 class ThroughContacts(BallMethod):
-    """Gradient method: derivative of the ball's motion in continuous time, including the times of contacts.
+    """Gradient method: derivative of continuous motion, including the times of contacts.
 
     Contact is decided at the end of each time step. A ball that starts higher reaches the floor later. The
     derivative of the time steps omits the change of the contact time. A saltation matrix at every contact
-    adds this change to the derivative. If impacts are located within a step, the program's own derivative
-    already contains the saltation matrix. Contact by projection is differentiated like an impact. Without a
-    damper, the force of a spring does not jump, and the result is the same as from the method `unrolled`.
+    adds this change to the derivative. If impacts are located within a step, the program's derivative is
+    already complete. Contact by projection is differentiated like an impact. Without a damper, the result is
+    the same as from `unrolled`.
     """
 
     name = "event-aware"
@@ -310,10 +309,10 @@ class ThroughContacts(BallMethod):
 
 
 class _SaltatingReset:
-    """Contact that resets velocities at the end of a step, but is differentiated like continuous motion."""
+    """Contact that resets velocities, but is differentiated like continuous motion."""
 
     def move(self, motion: Motion) -> Moved:
-        """Compute one step with a contact, and differentiate it by means of the saltation matrix."""
+        """Compute one step with a contact, and its continuous derivative."""
         made = super().move(motion)  # type: ignore[misc]
         height, v = motion.integrator.fly(motion.y, motion.v, motion.free, motion.rounding)
         arrived, nothing, bounce = lax.stop_gradient(v), jnp.zeros_like(v), self.restitution.astype(v.dtype)  # type: ignore[attr-defined]
@@ -343,7 +342,7 @@ class _SaltatingProjection(_SaltatingReset, Projection):
 
 class _SaltatingPenalty(Penalty):
     def move(self, motion: Motion) -> Moved:
-        """Compute one step with a spring whose damper force jumps at contact; add the saltation term."""
+        """Compute one step with a damped spring. Add the saltation term."""
         contact = super().move(motion).record.contact
         y, v = lax.stop_gradient((motion.y, motion.v))
         jump = jnp.where(contact, -1.0, 1.0).astype(v.dtype) * lax.stop_gradient(self.damping) * v
@@ -365,7 +364,7 @@ def _normal(v):
 
 
 def _events(problem: BallProblem, run: BallRun) -> tuple[int, int]:
-    """Return the number of contact events of a run, and the number of grazing events among them."""
+    """Return the number of contact events, and of grazing events."""
     world, contact = problem.world, run.contact
     free = jax.vmap(lambda step: world.free(step, contact.shape[1:]))(jnp.arange(run.steps))
     free, v = np.asarray(free, np.float64), run.v[:-1].astype(np.float64)

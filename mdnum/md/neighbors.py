@@ -1,4 +1,4 @@
-"""Verlet neighbor lists with a skin: rules for rebuilding, list builders, and the pairs in a list."""
+"""Verlet neighbor lists: rules for rebuilding, list builders, and listed pairs."""
 
 from __future__ import annotations
 
@@ -34,18 +34,18 @@ class RebuildRule:
     def first_allowed(self) -> int:
         """Smallest age, in steps, at which a neighbor list can be rebuilt.
 
-        LAMMPS calls a rebuild at the smallest age dangerous: an earlier rebuild may have been necessary."""
+        LAMMPS calls such a rebuild dangerous: it may be too late."""
         return max(self.every, self.delay)
 
     @property
     def safe(self) -> bool:
-        """True if this rule always rebuilds a neighbor list before motion has used up the skin."""
+        """True if lists are always rebuilt before atoms have moved too far."""
         return self.check and self.every == 1 and self.delay <= 1
 
 
 @dataclass(frozen=True)
 class PairTable:
-    """Pairs of one neighbor list, in both directions, in the memory layout of the force loop."""
+    """Pairs of one neighbor list, in the memory layout of the force loop."""
 
     # neighbor of each slot and atom, in sorted labels, padded with the number of atoms, shape (slots, atoms);
     # where the search left it, on the host or on a device
@@ -86,9 +86,9 @@ class PairTable:
     def decided(
         self, bits: UInt8[np.ndarray, "words atoms"]
     ) -> tuple[Int[np.ndarray, "pairs"], Int[np.ndarray, "pairs"]]:
-        """Return the atoms i < j of all pairs decided as inside, each pair once, in table order.
+        """Return atoms i < j of the pairs inside the cutoff, in table order.
 
-        For cutoff number c (counted from 0), c times the number of atoms is added to the atom index i.
+        For cutoff number c, c times the number of atoms is added to i.
         """
         slots, columns = set_bits(bits)
         channel, slots = np.divmod(slots, self.slots)
@@ -97,7 +97,7 @@ class PairTable:
         return (i + channel * len(self.order))[keep], j[keep]
 
     def listed(self, channels: int = 1) -> tuple[Int[np.ndarray, "pairs"], ...]:
-        """Return, for each pair and cutoff, both indices in sorted order, and i and j as in `decided`."""
+        """Return the sorted indices of each pair, and i and j as in `decided`."""
         slots, first = np.nonzero(self.index < len(self.order))
         second = self.index[slots, first]
         i, j = self.order[first], self.order[second]
@@ -107,7 +107,7 @@ class PairTable:
         return first, second, i + np.repeat(np.arange(channels), once.sum()) * len(self.order), j
 
     def unsorted(self) -> Int[np.ndarray, "atoms slots"]:
-        """Return each atom's neighbors in the input order; empty slots contain the number of atoms."""
+        """Return each atom's neighbors in input order. Empty slots contain the number of atoms."""
         atoms = self.index.shape[1]
         labels = np.append(self.order, atoms).astype(np.int32)
         out = np.empty((atoms, self.slots), np.int32)
@@ -127,13 +127,13 @@ class ListBuilder(Protocol):
     def build(
         self, positions: Float[np.ndarray | Array, "atoms 3"], cell: Cell, r_list: float, slots: int
     ) -> tuple[Int[np.ndarray | Array, "slots atoms"], Int[np.ndarray | Array, "atoms"], int]:
-        """Return neighbor table, atom order and largest neighbor count (above `slots`: pairs are missing)."""
+        """Return neighbor table, atom order and largest neighbor count. Above `slots`, pairs are missing."""
         ...
 
 
 @dataclass(frozen=True)
 class HostBuilder:
-    """List builder that runs mdnum's own cell list on the host, compiled by numba."""
+    """List builder with mdnum's own cell list, compiled by numba."""
 
     name: str = "host"
 
@@ -169,7 +169,7 @@ BUILDERS.add("device", "mdnum.md.device_search:BUILDER")
 
 
 def check_radius(cell: Cell, r_cut: float, skin: float) -> None:
-    """Raise an error if r_cut + skin is too large for the minimum-image convention.
+    """Raise an error if r_cut + skin is too large for the minimum image.
 
     Raises:
         InputError: r_cut + skin exceeds half the smallest perpendicular width of the box.
@@ -186,7 +186,7 @@ def check_radius(cell: Cell, r_cut: float, skin: float) -> None:
 
 @dataclass
 class VerletList:
-    """Builder of Verlet lists, which increases the number of neighbor slots per atom when needed."""
+    """Builder of Verlet lists. It adds neighbor slots when needed."""
 
     builder: ListBuilder  # the neighbor search
     rule: RebuildRule  # when to rebuild
@@ -199,7 +199,7 @@ class VerletList:
     slots: int = field(default=0)  # room per atom; 0 lets the density decide
 
     def build(self, positions: Float[np.ndarray | Array, "atoms 3"], cell: Cell) -> PairTable:
-        """Return the pairs closer than r_cut + skin for wrapped positions; add slots per atom if needed.
+        """Return the pairs closer than r_cut + skin. Positions must be wrapped.
 
         Raises:
             CapacityError: an atom would need more slots than there are other atoms.
@@ -238,7 +238,7 @@ class VerletList:
         return max(SLOTS, int(np.ceil(slots / SLOTS)) * SLOTS)
 
     def consumed(self, positions, cell: Cell, reference, reference_cell: Cell) -> float:
-        """Return the fraction of the skin that motion and strain have used up; above 1, pairs may be missing.
+        """Return the used fraction of the skin. Above 1, pairs may be missing.
 
         Args:
             positions, cell: present state. reference, reference_cell: state when the list was built.

@@ -1,10 +1,9 @@
-"""Pair forces, computed from a neighbor list that contains each pair in both directions.
+"""Pair forces from a neighbor list that contains each pair twice.
 
 Every pair is evaluated twice, once for each atom. Each atom sums over its neighbors in a fixed order, without
-scattered writes. In double precision on a CPU, forces are computed by one compiled loop (`md.kernel`). On
-other devices or in other precisions, XLA evaluates one group of neighbor slots for all atoms at a time.
-Decisions are packed into bits, so that temporary arrays fit in the cache. Evaluating all slots at once would
-take twice as long for 4,000 atoms and ten times as long for 32,000 atoms.
+scattered writes. On a CPU in double precision, one compiled loop (`md.kernel`) computes the forces.
+Otherwise, XLA evaluates one group of neighbor slots at a time. Decisions are packed into bits, so that
+temporary arrays fit in the cache. For 32,000 atoms, all slots at once would take ten times as long.
 """
 
 from __future__ import annotations
@@ -73,7 +72,7 @@ class PairForce(eqx.Module):
 
     @classmethod
     def create(cls, model: Any, cell: Cell, decider: PairDecider, policy, reduction) -> PairForce:
-        """Make the force object, with parameters and box in the dtypes of the precision policy."""
+        """Make the force object. Parameters and box get the dtypes of the policy."""
         return cls(
             model.astype(policy.dtype("force")),
             cell.astype(np.float64),
@@ -86,7 +85,7 @@ class PairForce(eqx.Module):
 
     @property
     def law(self) -> CutPotential | Guarded:
-        """The potential in arithmetic of the force dtype; 16-bit results are rounded at every operation."""
+        """The potential in the force dtype. 16-bit results are rounded at every operation."""
         model = self.model.typed
         return Guarded(model, self.zero, rounded) if self._short else model
 
@@ -95,7 +94,7 @@ class PairForce(eqx.Module):
         return self.policy.dtype("force").itemsize == 2
 
     def _in_force_dtype(self, x: Any) -> Float[Array, "..."]:
-        """Round a number to the force dtype, since XLA computes sixteen-bit types in a wider format."""
+        """Round a number to the force dtype. XLA computes 16-bit types in a wider format."""
         x = x.astype(self.policy.dtype("force"))
         return fence(x, self.zero) if self._short else x
 
@@ -118,11 +117,11 @@ class PairForce(eqx.Module):
 
     @property
     def _inside(self) -> str:
-        """Comparison (">" or ">=") of the margin with 0 that is true for a pair inside the cutoff."""
+        """Comparison (">" or ">=") of margin and 0 that means "inside the cutoff"."""
         return ">=" if self.decider.compare.endswith("<=") else ">"
 
     def _near(self, pair: Callable[..., Any], tensor: bool) -> kernel.Shortcut | None:
-        """Return a pair function without minimum image, for close atoms; None if it would save no time."""
+        """Return a pair function without minimum image. None if it saves no time."""
         if not any(self.cell.pbc) or (self.cell.orthorhombic and not tensor):
             return None
 
@@ -175,14 +174,14 @@ class PairForce(eqx.Module):
         return self.in_blocks(positions, tables, given, where, decisions=decisions, tensor=tensor)
 
     def in_one_loop(self, tables: Tables) -> bool:
-        """True if `kernel.over_pairs` can be used: double precision, few pair types, and a CPU."""
+        """True if `kernel.over_pairs` can be used: double precision, few pair types, a CPU."""
         roles = ("force", "decision", "accumulate")
         wide = {self.policy.geometry, *map(self.policy.dtype, roles)} == {np.dtype(np.float64)}
         few = tables.types is None or self.model.pair_types <= _FEW_TYPES
         return wide and few and self.reduction == Sequential() and foreign.known()
 
     def _terms(self, tensor: bool) -> Callable[..., tuple[Float[Array, "..."], ...]]:
-        """Return a function of a pair's displacement and decision that computes force, energy and virial.
+        """Return a function that computes force, energy and virial of a pair.
 
         Args:
             tensor: True for a virial with six components, in Voigt order.
@@ -203,7 +202,7 @@ class PairForce(eqx.Module):
         return terms
 
     def weights(self, tables: Tables) -> list[Float[Array, "atoms"]]:
-        """Per-atom weights of all weighted terms, with atoms in the order of the neighbor tables."""
+        """Weights of the atoms for all weighted terms, in table order."""
         return [one[tables.order] for one in self.model.weights if one is not None]
 
     def in_blocks(
@@ -216,7 +215,7 @@ class PairForce(eqx.Module):
         decisions: bool,
         tensor: bool = False,
     ) -> Forces:
-        """Return the same forces as `__call__`, for any precision, order of summation and device."""
+        """Return the same forces as `__call__`, for any precision and device."""
         judge, terms_of = self.judge(positions), self._terms(tensor)
         geometry, accumulate = self.policy.geometry, self.policy.dtype("accumulate")
         same = self.policy.dtype("decision") == geometry
@@ -253,7 +252,7 @@ class PairForce(eqx.Module):
 
 
 class ChannelForce(PairForce):
-    """Forces of potential terms with different cutoff radii, evaluated in turn over one neighbor list.
+    """Forces of potential terms that have different cutoff radii.
 
     The decisions of all terms are concatenated along the first array axis.
     """
@@ -302,7 +301,7 @@ def _joined(parts: Sequence[Any]) -> Decisions:
 
 
 def factors(model: CutPotential, products: Iterable[Any]) -> list[tuple[Any, ...]]:
-    """Return weight factors of the term energies for `CutPotential.evaluate`; empty if no term has weights.
+    """Return weight factors of the term energies. Empty if no term has weights.
 
     Args:
         products: products of the weights of both atoms, for terms with weights.
@@ -312,7 +311,7 @@ def factors(model: CutPotential, products: Iterable[Any]) -> list[tuple[Any, ...
 
 
 def _forces(sums: Sequence[Float[Array, "..."]], decisions: Decisions | None) -> Forces:
-    """Return forces from sums of `PairForce._terms`, in which every pair is counted for both of its atoms."""
+    """Return forces from sums that count every pair for both atoms."""
     fx, fy, fz, energy, *virial = sums
     half = jnp.asarray(0.5, energy.dtype)
     summed = [-jnp.sum(half * one, dtype=jnp.float64) for one in virial]
@@ -322,7 +321,7 @@ def _forces(sums: Sequence[Float[Array, "..."]], decisions: Decisions | None) ->
 
 @eqx.filter_custom_jvp
 def _in_one_loop(force: PairForce, positions, tables: Tables, given, where, *, decisions: bool, tensor: bool):
-    """Return the result of `PairForce.in_blocks` from one compiled loop; None if the loop cannot be used."""
+    """Compute forces in one compiled loop. None if the loop cannot be used."""
     terms_of = force._terms(False)
 
     def pair(own, other, types, *bits, near=False):
@@ -354,10 +353,10 @@ def _in_one_loop(force: PairForce, positions, tables: Tables, given, where, *, d
 
 
 def _virial(made: kernel.PairSums, x: Float[Array, "3 atoms"]) -> list[Float[Array, ""]]:
-    """Return the sum of force times displacement over all pairs, counted for both atoms, in Voigt order.
+    """Return the sum of force times displacement over all pairs, in Voigt order. Pairs count twice.
 
     The displacement of a pair is x_j - x_i minus lattice vectors. The virial sums force times position over
-    atoms. For the few pairs across a periodic boundary, the pair loop adds force times lattice vectors.
+    atoms. For pairs across a boundary, the loop adds force times lattice vectors.
     """
     return list(-2 * products(made.sums, x) - made.totals)
 
@@ -376,10 +375,10 @@ def _in_one_loop_jvp(primals, tangents, *, decisions: bool, tensor: bool):
 def imposed(
     inside: Bool[Array, "4 atoms"], given: UInt8[Array, "atoms"], where: UInt8[Array, "atoms"] | None
 ) -> Bool[Array, "4 atoms"]:
-    """Return the decisions on a group of neighbor slots: imposed if given, otherwise computed (`inside`).
+    """Return imposed decisions where given, otherwise the computed decisions (`inside`).
 
-    With a simple mask, distances are computed twice, and a time step of 864 atoms takes 2.2 times as long as
-    without imposed decisions. The factor is 1.3 with a mask per slot (`unpacked`), and 1.2 with this code.
+    With a simple mask, a step takes 2.2 times as long as without imposed decisions. This code takes 1.2 times
+    as long.
 
     Args:
         where: slots in which decisions are imposed; None for all.
@@ -390,18 +389,18 @@ def imposed(
 
 
 class Guarded(eqx.Module):
-    """A potential with cutoff; `how` rounds the result of every operation, or makes results reproducible."""
+    """A potential with cutoff, in arithmetic modified by `how` (rounded or reproducible)."""
 
     model: CutPotential
     zero: Int[Array, ""]
     how: Callable[..., Any] = eqx.field(static=True)
 
     def at_cutoff(self) -> AtCutoff:
-        """Return the constants of the potential at its cutoff, with arithmetic modified by `how`."""
+        """Return the constants of the potential at its cutoff."""
         return self.how(self.model.at_cutoff, self.zero)()
 
     def evaluate(self, r2, types, at: AtCutoff):
-        """Return energy and slope of the potential for pairs, with arithmetic modified by `how`."""
+        """Return energy and slope of the potential for pairs."""
         return self.how(self.model.evaluate, self.zero)(r2, types, at)
 
 
@@ -409,10 +408,10 @@ VOIGT = ((0, 0), (1, 1), (2, 2), (1, 2), (0, 2), (0, 1))
 
 
 def products(a: Float[Array, "_ atoms"], b: Float[Array, "_ atoms"]) -> Float[Array, "6"]:
-    """Return the six sums over atoms of a_i b_j, in Voigt order, for the first three rows i of a and j of b.
+    """Return the six sums over atoms of a_i b_j, in Voigt order.
 
-    XLA computes eight partial sums at a time with vector instructions. For 4,000 atoms, these partial sums
-    take a third of the time of a sequential sum.
+    XLA computes eight partial sums at a time with vector instructions. For 4,000 atoms, partial sums take a
+    third of the time.
     """
     pieces = [jnp.pad(one[:3], ((0, 0), (0, -one.shape[1] % 8))).reshape(3, 8, -1) for one in (a, b)]
     sums = [reduce(add, (pieces[0][i, k] * pieces[1][j, k] for k in range(8))) for i, j in VOIGT]
@@ -442,7 +441,7 @@ class ManyBodyForce(eqx.Module):
 
     @classmethod
     def create(cls, potential, cell: Cell, decider: PairDecider, policy: PrecisionPolicy) -> ManyBodyForce:
-        """Make the force object, with the box as jax arrays and parameters in the force dtype."""
+        """Make the force object, with parameters in the force dtype."""
         zero, dtype = zero_bits(policy.dtype("decision")), policy.dtype("force")
         if dtype != np.float64:
             potential = jax.tree.map(lambda a: a.astype(dtype) if eqx.is_inexact_array(a) else a, potential)
@@ -462,7 +461,7 @@ class ManyBodyForce(eqx.Module):
         given: UInt8[Array, "words atoms"] | None = None,
         where: UInt8[Array, "words atoms"] | None = None,
     ) -> Forces:
-        """Return forces as `PairForce` does; the total energy is assigned to the first atom."""
+        """Return forces as `PairForce` does. The first atom has the total energy."""
         made = self.decide(positions, tables)
         bits = made.bits if given is None else given
         if given is not None and where is not None:
@@ -479,7 +478,7 @@ class ManyBodyForce(eqx.Module):
     def neighbors(
         self, positions: Float[Array, "3 atoms"], tables: Tables, bits: UInt8[Array, "words atoms"]
     ) -> Any:
-        """Return the neighbor list for the energy function, which contains only pairs inside the cutoff."""
+        """Return the neighbor list for the energy function, with pairs inside the cutoff only."""
         from mdnum.md import jaxmd
 
         own, atoms = self.potential, positions.shape[1]
@@ -518,7 +517,7 @@ class ManyBodyForce(eqx.Module):
     def energy_of(
         self, tables: Tables, neighbor: Any, potential: Any = None
     ) -> Callable[[Any, Any, Any], Float[Array, ""]]:
-        """Return the energy as a function of sorted positions, lattice vectors (rows), and a deformation."""
+        """Return the energy as a function of sorted positions, lattice vectors and deformation."""
         own = self.potential if potential is None else potential
         return lambda x, matrix, by: own.deformed(self.placed(x, tables), neighbor, matrix, by)
 
@@ -540,7 +539,7 @@ class ManyBodyForce(eqx.Module):
 
 
 class MdState(NamedTuple):
-    """State of a simulation between two force evaluations, with atoms in the order of the tables."""
+    """State of a simulation between two force evaluations, in table order."""
 
     step: Int[Array, ""]  # the step whose forces come next
     x: Float[Array, "3 atoms"]  # wrapped positions at that step, shape (3, atoms)
@@ -552,8 +551,8 @@ class MdState(NamedTuple):
 class PairDynamics(eqx.Module):
     """Dynamics on a fixed neighbor list with imposed decisions.
 
-    The class is used to replay the decisions of another run, and to compute gradients at fixed decisions. A
-    normal simulation makes the same time steps, in compiled blocks, with decisions from its own positions.
+    It is used to replay decisions, and for gradients at fixed decisions. A normal run makes the same steps in
+    compiled blocks.
     """
 
     force: PairForce  # the pair force
@@ -562,7 +561,7 @@ class PairDynamics(eqx.Module):
     tables: Tables  # the list
 
     def margins(self, state: MdState) -> Float[Array, "groups 4 atoms"]:
-        """Return margins (threshold minus r or r², positive inside) of all slots; -inf for padding slots."""
+        """Return the margin (threshold minus r or r²) of each slot. -inf for padding slots."""
         judge = self.force.judge(state.x)
         index, types = self.tables.groups()
 
@@ -578,7 +577,7 @@ class PairDynamics(eqx.Module):
         return self.force.decide(state.x, self.tables).bits
 
     def step(self, state: MdState, decisions: UInt8[Array, "words atoms"]) -> MdState:
-        """Make one time step, with the forces of the pairs that are inside according to `decisions`."""
+        """Make one time step with the given pair decisions."""
         made = self.force(state.x, self.tables, decisions=False, given=decisions)
         order, cell = self.tables.order, self.force.cell
         end = one_step(self.integrator, cell, self.masses, order, *state, made)

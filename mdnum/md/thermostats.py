@@ -1,8 +1,8 @@
 """Thermostats that scale all velocities by one factor (Nosé-Hoover chains, stochastic rescaling).
 
-If the total momentum is zero, it stays zero, and the system has three fewer degrees of freedom
-(`Integrator.freedom`). The variables of a thermostat are always float64. Velocities are scaled in float64,
-too. If a factor near one were rounded to float32, all atoms would have the same relative error.
+A total momentum of zero stays zero. Then three degrees of freedom are lost (`Integrator.freedom`). The
+variables of a thermostat are always float64. Velocities are scaled in float64, too. A factor rounded to
+float32 would give all atoms the same relative error.
 """
 
 from __future__ import annotations
@@ -35,11 +35,10 @@ class Chain(NamedTuple):
     def act(
         self, kinetic: Number, freedom: int | Number, kT: Number, relaxation: Number, time: Number
     ) -> tuple[Number, Chain]:
-        """Advance the thermostat chain by a given time; return the velocity scale factor and the new chain.
+        """Advance the chain by a time. Return the velocity factor and the new chain.
 
-        Each of three substeps updates the thermostats of the chain from last to first, scales the velocities,
-        and updates the thermostats in reverse order (Tuckerman et al., J. Phys. A 39, 5629, 2006, the
-        operator L_NHC). The error is O(time⁵).
+        Each of three substeps is the operator L_NHC of Tuckerman et al., J. Phys. A 39, 5629, 2006. The error
+        is O(time⁵).
 
         Args:
             kinetic: kinetic energy of the atoms or the box, with the number of degrees of freedom.
@@ -67,13 +66,13 @@ class Chain(NamedTuple):
         return scale, Chain(jnp.stack(rate), jnp.stack(way))
 
     def energy(self, freedom: int | Number, kT: Number, relaxation: Number) -> Number:
-        """Return the energy of the chain (eq. 2.8 of Martyna, Klein, Tuckerman, J. Chem. Phys. 97, 2635)."""
+        """Return the energy of the chain (Martyna, Klein, Tuckerman, J. Chem. Phys. 97, 2635, eq. 2.8)."""
         shares = jnp.ones(len(self.rate)).at[0].set(freedom)
         return kT * jnp.sum(shares * (0.5 * jnp.square(relaxation * self.rate) + self.way))
 
 
 class NoseHooverChain(Integrator):
-    """Canonical ensemble by a Nosé-Hoover chain: velocity Verlet between two half-steps of the chain.
+    """Canonical ensemble by velocity Verlet and a Nosé-Hoover chain.
 
     The dynamics is deterministic and time-reversible. Source: Martyna, Klein, Tuckerman, J. Chem. Phys. 97,
     2635 (1992), integrated as in Tuckerman et al., J. Phys. A 39, 5629 (2006). A stiff system at low
@@ -116,7 +115,7 @@ class NoseHooverChain(Integrator):
 def rescaled(
     key: Array, kinetic: Number, freedom: int, kT: Number, relaxation: Number, time: Number
 ) -> Number:
-    """Return the scale factor of the velocities, from an exact stochastic step of the kinetic energy.
+    """Return the velocity factor of an exact stochastic step of the kinetic energy.
 
     Bussi, Donadio, Parrinello, J. Chem. Phys. 126, 014101 (2007), eqs. A7 and A8. Zero velocities stay zero.
 
@@ -136,11 +135,11 @@ def rescaled(
 
 
 class CSVR(Integrator):
-    """Stochastic velocity rescaling in the canonical ensemble: velocity Verlet, then a random scale factor.
+    """Canonical ensemble by velocity Verlet and stochastic velocity rescaling.
 
     Bussi, Donadio, Parrinello, J. Chem. Phys. 126, 014101 (2007). The random numbers depend only on the
-    random key and the step number. Two runs can have the same random numbers, and a resumed run continues
-    their sequence. The effective energy (total energy minus heat, eq. 15 of the paper) is conserved.
+    random key and the step number. A resumed run continues the sequence of random numbers. The effective
+    energy (total energy minus heat) is conserved (eq. 15).
 
     Example:
         >>> mdnum.simulation(atoms, argon, cut, timestep=0.002, temperature=90, integrator="csvr",

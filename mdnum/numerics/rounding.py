@@ -1,8 +1,8 @@
-"""Differences of floats in ulps, and bounds on the rounding errors of pair distances.
+"""Differences of floats in ulps, and rounding errors of pair distances.
 
-A displacement is x_j - x_i minus at most one lattice vector for each periodic axis, rounded after every
-subtraction. The squared components of the displacement are added in the order x, y, z. The error of a
-rounding is proportional to the magnitude of its result. The class `Reach` bounds the results' magnitudes.
+A displacement is x_j - x_i minus at most one lattice vector per periodic axis. Its squared components are
+added in the order x, y, z. The error of a rounding is proportional to the magnitude of its result. The class
+`Reach` bounds the results' magnitudes.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from numpy.typing import ArrayLike, DTypeLike
 
 
 def unit_roundoff(dtype: DTypeLike) -> float:
-    """Return the unit roundoff, the largest relative error of a rounding to nearest (Higham 2002, 2.1)."""
+    """Return the largest relative error of a rounding (Higham 2002, 2.1)."""
     # ml_dtypes' finfo knows bfloat16 too
     return float(ml_dtypes.finfo(np.dtype(dtype)).eps) / 2
 
@@ -26,7 +26,7 @@ def _signed(dtype: np.dtype) -> np.dtype:
 
 
 def ordinal(x: ArrayLike) -> Int[np.ndarray, "..."]:
-    """Return the index of x among all floats of the same dtype, as a signed integer; ±0 has index 0.
+    """Return the index of x among all floats of its dtype. ±0 has index 0.
 
     Adjacent floats have adjacent indices, so index differences count ulps. The index of NaN has no meaning.
     """
@@ -38,7 +38,7 @@ def ordinal(x: ArrayLike) -> Int[np.ndarray, "..."]:
 
 
 def neighbor(x, ulps: int, dtype: DTypeLike = np.float64):
-    """Return the float that is `ulps` floats above x (below x if `ulps` is negative)."""
+    """Return the float `ulps` places above x. Negative numbers mean below."""
     x = np.asarray(x, dtype)
     integer = _signed(x.dtype)
     place = ordinal(x) + ulps
@@ -54,7 +54,7 @@ _SECOND_ORDER = 1.001
 
 
 def gamma(n: int, dtype: DTypeLike = np.float64) -> float:
-    """Return gamma_n = n u / (1 - n u), a bound on the relative error of n roundings (Higham 2002, 3.1)."""
+    """Return n u / (1 - n u), which bounds the error of n roundings (Higham 2002, 3.1)."""
     nu = n * unit_roundoff(dtype)
     return nu / (1.0 - nu)
 
@@ -64,7 +64,7 @@ Vector = tuple[float, float, float]
 
 @dataclass(frozen=True)
 class Reach:
-    """Lattice vectors and largest coordinates of a box, which bound the rounding errors of distances."""
+    """Lattice vectors and largest coordinates of a box, for rounding bounds."""
 
     # vectors of the periodic axes in the order in which they are taken off, length
     lattice: tuple[Vector, ...] = ()
@@ -76,11 +76,10 @@ class Reach:
         return cls(tuple(_three(row) for row in lattice), _three(coordinate))
 
     def rounded(self) -> tuple[Float[np.ndarray, "3"], int]:
-        """Return, by axis, the sum of |lattice components| over all rounded results, and their number.
+        """Return the sum of |components| of all rounded results by axis, and their number.
 
-        After the first subtraction, a component of the displacement is d + n_1 a_1 + n_2 a_2 + n_3 a_3, where
-        d is its final value and each n is -1, 0 or 1. Each further subtraction of a lattice vector removes
-        one of the terms n_k a_k.
+        The first subtraction gives d + n_1 a_1 + n_2 a_2 + n_3 a_3, with final value d and n in {-1, 0, 1}.
+        Each further subtraction removes one term n_k a_k.
         """
         sizes, most = np.zeros(3), 1
         for axis in range(3):

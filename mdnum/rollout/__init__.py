@@ -1,4 +1,4 @@
-"""Simulation runs: the time-stepping loop with Verlet lists, its records, and the run folder with results."""
+"""Simulation runs: the loop over time steps, its records, and the run folder."""
 
 from __future__ import annotations
 

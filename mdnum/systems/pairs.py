@@ -1,7 +1,7 @@
-"""Potential constants and cutoff radii for every pair of species, and the longest interaction radius.
+"""Potential constants and cutoff radii for every pair of species.
 
-A system file gives one set of constants, or one set per pair of species. No mixing rule is applied: the file
-must list every pair of species in the structure. A forgotten cross term is an error.
+A system file gives one set of constants, or one set per pair of species. No mixing rule is applied. The file
+must list every pair of species. A forgotten cross term is an error.
 """
 
 from __future__ import annotations
@@ -93,7 +93,7 @@ def cutoff_radii(spec: SystemSpec | Interaction, species: tuple[str, ...]) -> tu
 
 
 def longest_radius(spec: SystemSpec, species: tuple[str, ...], folder: Path) -> float:
-    """Return the largest distance (a length) at which a pair of atoms interacts directly."""
+    """Return the largest distance at which two atoms interact directly."""
     potential = spec.potential
     if potential is None or isinstance(potential, schema.PairPotentialTable):
         longest = 0.0

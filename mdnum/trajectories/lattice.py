@@ -1,14 +1,12 @@
-"""Lattice reduction of a box, sorting of atoms into bins, and the loop that finds pairs within a radius.
+"""Reduction of lattice vectors, bins of atoms, and the search for pairs.
 
-Lattice vectors are reduced first, so that a search in a skewed box is as fast as in the compact box with the
-same lattice. Every decision is based on the length of (x_j - x_i) + s_0 a_0 + s_1 a_1 + s_2 a_2, computed in
-this order with i < j. Here, x are stored coordinates, s integers and a reduced vectors. A pair decision does
-not depend on the search algorithm that found the pair.
+Lattice vectors are reduced first, so that skewed boxes are searched quickly. Decisions use the length of (x_j
+- x_i) + s_0 a_0 + s_1 a_1 + s_2 a_2, in this order, with i < j. Here, x are stored coordinates, s integers
+and a reduced vectors. A decision does not depend on the search algorithm.
 
-For a search, the reduced box is divided into bins. Coordinates along a nonperiodic direction are folded onto
-a limited number of bins, so that a distant atom does not enlarge the grid. For each bin, images of the atoms
-in all nearby bins are gathered (several images per atom in a small box). Every atom of a bin is then compared
-with all atoms gathered for this bin.
+For a search, the reduced box is divided into bins. Along a nonperiodic direction, the number of bins is
+limited. For each bin, the atoms of all nearby bins and their images are gathered. Each atom of the bin is
+compared with these atoms.
 """
 
 from __future__ import annotations
@@ -35,7 +33,7 @@ INSIDE, DIRECTED = 0, 2
 
 
 class ReducedLattice(NamedTuple):
-    """Lattice vectors of a box in reduced form, and derived quantities, for compiled neighbor searches."""
+    """Reduced lattice vectors of a box, for compiled neighbor searches."""
 
     vectors: Float[np.ndarray, "3 3"]  # reduced, as rows, length; zero along directions that do not repeat
     periodic: Bool[np.ndarray, "3"]  # which rows repeat
@@ -45,16 +43,16 @@ class ReducedLattice(NamedTuple):
 
     @property
     def narrowest(self) -> float:
-        """Smallest width of the box, in length units: a lower bound of the lengths of lattice vectors."""
+        """Smallest width of the box. No lattice vector is shorter."""
         return float(self.widths.min())
 
     @property
     def volume(self) -> float:
-        """Volume of the box; along a nonperiodic direction, a width of one unit of length is assumed."""
+        """Volume of the box. A nonperiodic direction counts as one unit of length."""
         return float(1.0 / abs(np.linalg.det(self.inverse)))
 
     def rounding(self, largest: float, radius: float) -> float:
-        """Return the rounding error (length) of a distance near `radius`, for coordinates up to `largest`.
+        """Return the rounding error (length) of a distance near `radius`.
 
         Source: Higham, Accuracy and Stability of Numerical Algorithms, 2nd ed., section 3.1.
         """
@@ -106,8 +104,8 @@ def shortest(
 ) -> tuple[Float[np.ndarray, "atoms 3"], Float[np.ndarray, "atoms 3"]]:
     """Return displacements by the minimum-image convention, and the numbers of lattice vectors subtracted.
 
-    Displacements are correct for atoms that moved by less than half the width of the box. If the box is
-    invalid, displacements are returned unchanged.
+    Each atom must have moved by less than half the box width. If the box is invalid, displacements are
+    returned unchanged.
     """
     try:
         lattice = lattice_of(box)
@@ -118,7 +116,7 @@ def shortest(
 
 
 def own_images(lattice: ReducedLattice, radius: float) -> Float[np.ndarray, "images"]:
-    """Return squared lengths of lattice vectors up to `radius`, ascending; opposite vectors count once."""
+    """Return squared lengths of lattice vectors up to `radius`. Opposite vectors count once."""
     if not lattice.periodic.any() or radius < lattice.narrowest * (1 - 1e-9):
         return np.zeros(0)
     vectors, most = lattice.vectors, np.where(lattice.periodic, radius / lattice.widths + 1, 0).astype(int)
@@ -133,7 +131,7 @@ def own_images(lattice: ReducedLattice, radius: float) -> Float[np.ndarray, "ima
 # inlined: a call that takes arrays costs more than what is done here
 @njit(inline="always")
 def square_of(x, i, j, s0, s1, s2, vectors):
-    """Return the squared distance that every decision uses, from atom i to an image of atom j (i < j)."""
+    """Return the squared distance of atom i and an image of atom j (i < j)."""
     if s0 == 0 and s1 == 0 and s2 == 0:
         d0, d1, d2 = x[j, 0] - x[i, 0], x[j, 1] - x[i, 1], x[j, 2] - x[i, 2]
     else:
@@ -145,11 +143,10 @@ def square_of(x, i, j, s0, s1, s2, vectors):
 
 @njit(inline="never")
 def near_squares(x, i, j, lattice, y, squares):
-    """Compute squared pair distances by rounding fractional coordinates; `y` is a work array (3, block).
+    """Compute squared pair distances. `y` is a work array (3, block).
 
-    The loop needs no branches, because zero shifts leave squared distances unchanged and lattice vectors are
-    zero along nonperiodic directions. Coordinates are gathered first, so that all other operations are vector
-    instructions. The lattice vectors are loaded only once.
+    Lattice vectors are zero along nonperiodic directions, so no branches are needed. Coordinates are gathered
+    first, so that all other operations are vector instructions. The lattice vectors are loaded only once.
     """
     vectors, inverse = lattice.vectors, lattice.inverse
     y0, y1, y2 = y[0], y[1], y[2]
@@ -175,7 +172,7 @@ def near_squares(x, i, j, lattice, y, squares):
 
 @njit
 def image_square(x, i, j, rank, lattice):
-    """Return the squared distance from i to an image of j; `rank` is the number of nearer images of j.
+    """Return the squared distance from i to an image of j. `rank` counts nearer images.
 
     Either i < j, or i == j (opposite images count once). If no image of j has this rank, the result is inf.
     """
@@ -243,12 +240,12 @@ class Participants:
 
     @property
     def squares(self) -> Float[np.ndarray, "species species"]:
-        """Squared cutoff radius of each pair of species; negative for pairs that are never neighbors."""
+        """Squared cutoff radius of each pair of species. Negative if never neighbors."""
         return np.where(self.radii >= 0, self.radii * self.radii, -1.0)
 
     @property
     def both(self) -> Bool[np.ndarray, "atoms"]:
-        """True for atoms in both groups; only such atoms can be neighbors of their own images."""
+        """True for atoms in both groups."""
         return self.centers & self.others
 
     @cached_property
@@ -260,7 +257,7 @@ class Participants:
 
 @dataclass(frozen=True)
 class Placed:
-    """Positions of the atoms to which a membership rule applies, and the reduced lattice, at one frame."""
+    """Positions and reduced lattice at one frame, for one membership rule."""
 
     positions: Float[np.ndarray, "atoms 3"]  # as stored, anywhere, length
     lattice: ReducedLattice  # of the box
@@ -268,7 +265,7 @@ class Placed:
 
 
 class SearchLimits(NamedTuple):
-    """Lower and upper limits of squared distances in a pair search, for each pair of species."""
+    """Lower and upper limits of squared distances, for each pair of species."""
 
     kind: int  # `INSIDE` or `DIRECTED`
     low: Float[np.ndarray, "species species"]  # pairs nearer than this are inside for certain
@@ -277,14 +274,14 @@ class SearchLimits(NamedTuple):
 
     @classmethod
     def of(cls, radii: Float[np.ndarray, "species species"], kind: int, band: float) -> SearchLimits:
-        """Return the squares of each cutoff radius minus `band`, and of each cutoff radius plus `band`."""
+        """Return the squares of the radii minus `band` and plus `band`."""
         low = np.where(radii >= 0, np.maximum(radii - band, 0.0) ** 2, np.inf)
         high = np.where(radii >= 0, (radii + band) ** 2, -1.0)
         return cls(kind, low, high, float((radii.max(initial=0.0) + band) ** 2))
 
 
 class Candidates(NamedTuple):
-    """Output buffers for the pairs of a search; pairs beyond the capacity are only counted."""
+    """Output buffers of a search. Pairs beyond the capacity are only counted."""
 
     i: Int[np.ndarray, "room"]  # pairs that are inside for certain
     j: Int[np.ndarray, "room"]
@@ -296,7 +293,7 @@ class Candidates(NamedTuple):
 
     @classmethod
     def room(cls, certain: int, open: int) -> Candidates:
-        """Allocate buffers for the given numbers of decided pairs and of pairs still to be decided."""
+        """Allocate buffers for decided pairs and for open pairs."""
         i, j, i_open, j_open, code = (np.empty(n, np.int32) for n in (certain, certain, open, open, open))
         return cls(i, j, i_open, j_open, code, np.empty(open), np.zeros(3, np.int64))
 
@@ -322,7 +319,7 @@ class Binned(NamedTuple):
 
 
 def binned(placed: Placed, who: Participants, reach: float) -> Binned:
-    """Sort atoms into bins for a search of pairs up to the distance `reach`.
+    """Sort atoms into bins for pairs up to the distance `reach`.
 
     Raises:
         InputError: the box is so small that too many images are within `reach`.
@@ -347,10 +344,10 @@ def binned(placed: Placed, who: Participants, reach: float) -> Binned:
 
 
 def grid_for(lattice: ReducedLattice, radius: float, atoms: int, extent: Float[np.ndarray, "3"]):
-    """Return, for each of the three axes, the number of bins, the search range in bins, and the bin width.
+    """Return the number of bins, the search range and the bin width by axis.
 
     The number of bins is at most about twice the number of atoms. `extent` is the extent of the atoms along
-    each nonperiodic axis, in length units.
+    nonperiodic axes.
     """
     bins, reach, step = np.ones(3, np.int64), np.ones(3, np.int64), np.ones(3)
     room = max(64.0, 2.0 * atoms)
@@ -379,7 +376,7 @@ def grid_for(lattice: ReducedLattice, radius: float, atoms: int, extent: Float[n
 
 @njit
 def wrap(x, lattice, bins, step):
-    """Wrap atoms; return wrapped positions, numbers of lattice vectors subtracted, and each atom's bin."""
+    """Wrap atoms. Return positions, subtracted lattice vectors, and bins."""
     wrapped, home, bin_of = np.empty(x.shape), np.empty(x.shape, np.int64), np.empty(x.shape[0], np.int64)
     vectors, inverse, periodic = lattice.vectors, lattice.inverse, lattice.periodic
     for i in range(x.shape[0]):
@@ -409,7 +406,7 @@ def wrap(x, lattice, bins, step):
 
 @njit
 def _sorted_by_bin(bin_of, chosen, total):
-    """Sort the chosen atoms by bin; return the first index of each bin, and the sorted atom indices."""
+    """Sort atoms by bin. Return the first index of each bin, and the atoms."""
     start = np.zeros(total + 1, np.int64)
     count = 0
     for i in range(bin_of.shape[0]):
@@ -436,7 +433,7 @@ def lattice_vector(code):
 
 @njit
 def _run(d0, d1, d2, b0, b1, b2, bins, last):
-    """Return a row of bins at offset d from bin b: lattice vector, first bin, last bin, next offset d2."""
+    """Return a row of bins: lattice vector, first bin, last bin, next offset."""
     n0, n1, n2 = (b0 + d0) // bins[0], (b1 + d1) // bins[1], (b2 + d2) // bins[2]
     c0, c1, low = b0 + d0 - n0 * bins[0], b1 + d1 - n1 * bins[1], b2 + d2 - n2 * bins[2]
     high = min(bins[2] - 1, low + last - d2)
@@ -446,7 +443,7 @@ def _run(d0, d1, d2, b0, b1, b2, bins, last):
 
 @njit
 def _most_around(bins, reach, start):
-    """Return upper limits of the number of atoms, and of rows of contiguous bins, within reach of one bin."""
+    """Return the largest possible number of atoms and rows near one bin."""
     atoms, runs = 0, 0
     for b0 in range(bins[0]):
         for b1 in range(bins[1]):
@@ -467,7 +464,7 @@ def _most_around(bins, reach, start):
 # candidate, and the loop its vector instructions.
 @njit(inline="never")
 def _within(near, first, last, x0, x1, x2, largest, squares, flags, chosen):
-    """List and count the atoms in near[:, first:last] whose squared distance from x is up to `largest`."""
+    """List and count the atoms whose squared distance from x is up to `largest`."""
     near0, near1, near2 = near[0, first:last], near[1, first:last], near[2, first:last]
     for k in range(near0.shape[0]):
         y0, y1, y2 = near0[k] - x0, near1[k] - x1, near2[k] - x2
@@ -484,10 +481,10 @@ def _within(near, first, last, x0, x1, x2, largest, squares, flags, chosen):
 
 @njit
 def meet(atoms, limits, found):
-    """Record the neighbor pairs of all central atoms; return the numbers of decided and of undecided pairs.
+    """Record neighbor pairs. Return the numbers of decided and undecided pairs.
 
-    Pairs within one group are visited once, by examining half of the bins around each bin. For two groups,
-    all bins around a center are examined; a pair of atoms in both groups is visited twice and counted once.
+    Within one group, half of the bins around each bin are examined. For two groups, all bins are examined.
+    Pairs found twice count once.
     """
     written, left = 0, 0
     start, bins, reach, species = atoms.start, atoms.bins, atoms.reach, atoms.species

@@ -1,7 +1,7 @@
-"""Searches for pairs within a distance and for nearest neighbors in a frame; comparison of two frames.
+"""Searches for pairs and nearest neighbors in a frame, and comparison of frames.
 
 Distances in a search contain the rounding error of wrapped coordinates. Distances close to a threshold are
-recomputed from stored coordinates (`lattice.square_of`), so all search algorithms find the same pairs.
+recomputed (`lattice.square_of`), so all algorithms find the same pairs.
 """
 
 from __future__ import annotations
@@ -44,7 +44,7 @@ _MOST_IMAGES_EACH, _MOST_REPEATED = 100, 2_000_000
 
 
 class Found(NamedTuple):
-    """Pairs of atoms found by a search, one entry per pair and image, in no particular order."""
+    """Pairs found by a search, one per image, in any order."""
 
     kind: int  # `INSIDE` or `DIRECTED`
     i: Int[np.ndarray, "pairs"]  # the center of a directed one, else either
@@ -64,7 +64,7 @@ class NeighborRows(NamedTuple):
     square: Float[np.ndarray, "stored"]  # squared distances, where the rule is directed; else empty
 
     def pairs(self) -> tuple[Int[np.ndarray, "pairs"], Int[np.ndarray, "pairs"]]:
-        """Return the arrays i and j of all pairs of atoms, row by row."""
+        """Return the atoms i and j of all pairs, row by row."""
         i = np.repeat(np.arange(len(self.first)), self.count)
         inside = np.arange(len(i)) - np.repeat(np.cumsum(self.count) - self.count, self.count)
         return i, self.other[self.first[i] + inside].astype(np.int64)
@@ -80,7 +80,7 @@ def search(
     room: int = 0,
     open_room: int = 0,
 ) -> Found:
-    """Find pairs of atoms within a radius, except for images of an atom itself (see `lattice.own_images`).
+    """Find pairs of atoms within a radius. For an atom's own images, see `lattice.own_images`.
 
     Args:
         kind: pairs to record: `INSIDE` (inside the radius) or `DIRECTED` (within radius + band of each
@@ -117,9 +117,9 @@ def search(
 
 @njit(inline="always")
 def exact_square(x, home, i, j, n0, n1, n2, vectors):
-    """Return the squared distance to compare with the threshold; n is the image shift of j after wrapping.
+    """Return the squared distance that is compared with the threshold. n is the image of j.
 
-    The squared distance is bitwise the same if atoms are exchanged: only signs of rounded numbers change.
+    The squared distance has the same bits if atoms are exchanged.
     """
     s0, s1, s2 = n0 + home[i, 0] - home[j, 0], n1 + home[i, 1] - home[j, 1], n2 + home[i, 2] - home[j, 2]
     return square_of(x, i, j, s0, s1, s2, vectors)
@@ -129,7 +129,7 @@ def exact_square(x, home, i, j, n0, n1, n2, vectors):
 def _settle(x, atoms, kind, square, radius, bound, found):
     """Determine from stored coordinates which pairs near thresholds are inside; return smallest |margin|.
 
-    In a directed search, the squared distances in `found.value` are recomputed from stored coordinates.
+    In a directed search, squared distances are recomputed from stored coordinates.
     """
     smallest, home, vectors, species = np.inf, atoms.home, atoms.lattice.vectors, atoms.species
     for k in range(found.counts[1]):
@@ -150,7 +150,7 @@ def _settle(x, atoms, kind, square, radius, bound, found):
 
 
 def _expected(lattice: ReducedLattice, centers: int, others: int, radius: float) -> float:
-    """Estimate the number of atom pairs within `radius` from the density; 0 if an axis is not periodic."""
+    """Estimate the number of pairs within `radius`. 0 if an axis is not periodic."""
     if not lattice.periodic.all():
         return 0.0
     images = (4.0 / 3.0 * np.pi * radius**3) / lattice.volume
@@ -180,7 +180,7 @@ def _check_count(pairs: float, radius: float) -> None:
 
 
 def _memory() -> float:
-    """Return the memory of the machine in bytes; 32 GB if it is unknown."""
+    """Return the memory of the machine in bytes. 32 GB if unknown."""
     try:
         return float(os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE"))
     except (AttributeError, ValueError, OSError):
@@ -188,7 +188,7 @@ def _memory() -> float:
 
 
 def rows_of(found: Found, atoms: int) -> NeighborRows:
-    """Sort pairs into one row per first atom; in undirected pairs, the atom with the lower index is first."""
+    """Sort pairs into one row per atom. In undirected pairs, the lower index is first."""
     i, j, directed = found.i, found.j, found.kind == DIRECTED
     low, high = (i, j) if directed else (np.minimum(i, j), np.maximum(i, j))
     room = np.empty((4, len(i)), np.int64)
@@ -213,7 +213,7 @@ class Chosen(NamedTuple):
 def nearest(
     placed: Placed, who: Participants, rule: Nearest | Capped, *, band: float, bound: float
 ) -> Chosen:
-    """Find the nearest neighbors of each center, as many as the membership rule sets (see `search`)."""
+    """Find the nearest neighbors of each center (arguments as in `search`)."""
     positions, lattice = placed.positions, placed.lattice
     atoms, reach, centers = len(positions), rule.reach, who.centers
     # a distance that no pair exceeds: a lattice has no end
@@ -253,7 +253,7 @@ def nearest(
 def _choose(
     rows, made, own, centers, both, most, reach, bound, complete, searched, last_in, first_out, lacking
 ):  # fmt: skip
-    """Keep the nearest neighbors of each center; return several counts and the smallest |margin|."""
+    """Keep the nearest neighbors of each center. Return counts and the smallest |margin|."""
     written, close, smallest, short = 0, 0, np.inf, 0
     for i in range(rows.first.shape[0]):
         if not centers[i]:
@@ -309,7 +309,7 @@ def _choose(
 
 
 def _guess(placed: Placed, who: Participants, most: int, everything: float) -> float:
-    """Estimate a radius within which most atoms have as many neighbors as the membership rule requires."""
+    """Estimate a radius within which most atoms have enough neighbors."""
     lattice, candidates = placed.lattice, int(who.others.sum())
     if not candidates:
         return 1.0 if not np.isfinite(everything) else max(everything, 1e-300)
@@ -324,7 +324,7 @@ def _guess(placed: Placed, who: Participants, most: int, everything: float) -> f
 
 
 class Changed(NamedTuple):
-    """Unsorted pairs of atoms for which decisions differ between two frames, as indices of the atoms."""
+    """Pairs of atoms whose decision differs between two frames."""
 
     i: Int[np.ndarray, "flips"]
     j: Int[np.ndarray, "flips"]
@@ -338,7 +338,7 @@ class Changed(NamedTuple):
 
 
 def compared(before: NeighborRows, now: NeighborRows, room: int) -> Changed:
-    """Return atom pairs whose decision differs between two frames; `room` is the initial buffer size."""
+    """Return pairs whose decision differs between two frames. `room` is the buffer size."""
     while True:
         made = Changed.room(room)
         total = _compared(before, now, made)
@@ -349,7 +349,7 @@ def compared(before: NeighborRows, now: NeighborRows, room: int) -> Changed:
 
 @njit
 def _compared(old, new, made):
-    """Write pairs of atoms whose decision differs, as many as the buffer holds; return their total number."""
+    """Write the differing pairs into the buffer. Return their total number."""
     atoms = old.first.shape[0]
     seen = np.zeros((atoms, 2), np.int32)
     total, room = 0, made.i.shape[0]
@@ -379,7 +379,7 @@ def image_distances(
     rank: Int[np.ndarray, "pairs"],
     directed: bool = False,
 ) -> Float[np.ndarray, "pairs"]:
-    """Return the distance from i to an image of j; `rank` is the number of nearer images of j.
+    """Return the distance from i to an image of j. `rank` counts nearer images.
 
     If there is no such image of j, the distance is inf. A directed rule counts opposite images separately.
     """
@@ -405,7 +405,7 @@ def _image_distances(x, lattice, i, j, rank, out):
 
 
 def ranks(i: Int[np.ndarray, "pairs"], j: Int[np.ndarray, "pairs"]) -> Int[np.ndarray, "pairs"]:
-    """Return the numbers 0, 1, 2, ... within each sequence of entries with equal (i, j)."""
+    """Number the entries with equal (i, j) from 0."""
     new = np.ones(len(i), bool)
     new[1:] = (i[1:] != i[:-1]) | (j[1:] != j[:-1])
     at = np.flatnonzero(new)

@@ -53,10 +53,10 @@ def sweep(
     keep_runs: bool = False,
     **keep: Unpack[Keep],
 ) -> Outcome:
-    """Find the numerical choices that change results, and the cheapest setting that is accurate enough.
+    """Find the numerical choices that change results, and the cheapest accurate setting.
 
-    Each point (a run with one setting and one seed) is stored on disk. If a sweep was stopped, or is repeated
-    with more values, seeds or measures, only the missing points are computed.
+    Each point (one setting and one seed) is stored on disk. A repeated sweep computes only the missing
+    points.
 
     Example:
         >>> mdnum.sweep("argon/liquid-864", {"dynamics.timestep": [0.001, 0.002, 0.004]}, seeds=8)
@@ -137,7 +137,7 @@ def _assignments(name: str, texts: Sequence[str]) -> Any:
 
 
 def _told(system: str, over: Sequence[str], given: dict[str, Any]) -> Any:
-    """Return the plan of a sweep without running it: points, missing points, expected time and disk space."""
+    """Return the plan of a sweep: points, missing points, time and disk space."""
     from mdnum.verbs import Reply
 
     where = given.pop("points_in", None) or Path(given.get("out") or "runs/x").parent / "sweep-points"
@@ -168,7 +168,7 @@ def _told(system: str, over: Sequence[str], given: dict[str, Any]) -> Any:
 def _compute(
     place: Workspace, plan: Plan, log: Any, on: Any, workers: int | None, keep: bool
 ) -> dict[str, Any]:
-    """Compute missing points, wait for points that another sweep computes, and return point counts."""
+    """Compute missing points, and wait for points of other sweeps. Return point counts."""
     wanted = {one.address: one for one in plan.points if not one.wrong}
     missing = [a for a in wanted if not enough(place.result(a), plan.wanted)]
     missed = place.nearest(wanted[missing[0]].state) if missing else None
@@ -246,7 +246,7 @@ def _compute(
 def _after_a_loss(
     place: Workspace, one: Task, wanted: Mapping[str, Planned], error: BaseException, counts: dict[str, Any]
 ) -> list[list[Planned]]:
-    """After repeated crashes of a task, mark its current point as failed and return its remaining points."""
+    """After repeated crashes, mark the current point as failed. Return the points left."""
     from mdnum.sweeps.points import write_result
 
     again = []

@@ -1,4 +1,4 @@
-"""The bouncing ball in exact arithmetic, for time steps that consist of sums and products of floats."""
+"""The bouncing ball in exact arithmetic, for steps of sums and products."""
 
 from __future__ import annotations
 
@@ -54,9 +54,9 @@ def nearest(value: Decimal) -> float:
 
 
 def ball_history(world: World, start: BallState, steps: int) -> BallRun:
-    """Compute the run of a ball in exact arithmetic, from the numbers stored in `world`.
+    """Compute the run of a ball in exact arithmetic.
 
-    Quantities that do not affect decisions (residuals, stopping margins, contact flips) are not recorded.
+    Quantities that do not affect decisions, such as residuals, are not recorded.
 
     Error: recorded values are rounded to double precision; the calculation itself is exact.
 
@@ -82,7 +82,7 @@ def ball_history(world: World, start: BallState, steps: int) -> BallRun:
 
 
 class _ExactBall:
-    """State of the balls in exact numbers, with the function that makes one time step."""
+    """State of the balls in exact numbers, with the time step."""
 
     def __init__(self, world: World, start: BallState):
         contact, scheme = world.contact, world.integrator
@@ -204,7 +204,7 @@ class _ExactBall:
 
 
 class _ExactRule:
-    """A solver's stopping rule in exact numbers, for one residual of all balls or one residual per ball."""
+    """Stopping rule of a solver, in exact numbers."""
 
     def __init__(self, world: World):
         rule: Any = world.contact.stop  # type: ignore[attr-defined]
@@ -217,7 +217,7 @@ class _ExactRule:
         self.tol = None if isinstance(rule, FixedCount) else _held(world, rule.tol)
 
     def measure(self, depths: Balls) -> Balls:
-        """Return the solver's residual for the whole batch of balls, or for each ball."""
+        """Return the residual of the whole batch or of each ball."""
         if isinstance(self.rule, PerInstance):
             return depths
         if isinstance(self.rule, GlobalSum):
@@ -231,7 +231,7 @@ class _ExactRule:
         return [largest]
 
     def stops(self, residual: Decimal, first: Decimal, iteration: int) -> bool:
-        """Return True if the solver's residual is below the threshold of the stopping rule."""
+        """Return True if the residual is below the threshold."""
         if self.enter is not None and iteration == 0:
             return residual < self.enter
         if self.tol is None:
@@ -242,7 +242,7 @@ class _ExactRule:
 
 
 def _held(world: World, value: Any) -> Decimal:
-    """Return the threshold of a decision, rounded to the dtype in which decisions are made."""
+    """Return the threshold of a decision, rounded to the dtype of decisions."""
     return exactly(float(np.asarray(value).astype(world.policy.dtype("decision"))))
 
 
