@@ -1,6 +1,6 @@
 """Operations on packed bits (one bit per cutoff decision), and sorting of integers.
 
-This module is not in `mdnum.numerics`, because the analysis of trajectories uses it without jax.
+This module works without jax, for the analysis of trajectories.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from mdnum.vectors import lowest_bit
 
 @njit
 def _scan(before, rows, columns, row, slot, column, values):
-    """Record bits that change from row to row, as many as fit in the arrays; return the number of changes."""
+    """Record the bits that change from row to row. Return the number of changes."""
     at, room = 0, row.shape[0]
     for r in range(rows.shape[0]):
         # the eight slots that the scan is in, and the places of their bytes
@@ -43,7 +43,7 @@ def changes_in_time(
 ) -> tuple[
     Int[np.ndarray, "flips"], Int[np.ndarray, "flips"], Int[np.ndarray, "flips"], UInt8[np.ndarray, "flips"]
 ]:
-    """Find all decisions (packed bits) of a neighbor list that change from one step to the next.
+    """Find all pair decisions that change from one step to the next.
 
     Args:
         before: decisions before the first row.
@@ -74,7 +74,7 @@ def changes_in_time(
 def set_bits(
     packed: UInt8[np.ndarray, "words columns"],
 ) -> tuple[Int[np.ndarray, "set"], Int[np.ndarray, "set"]]:
-    """Return the row and the column of every set bit in an array of packed bits."""
+    """Return the row and the column of every set bit."""
     _, slots, columns, _ = changes_in_time(np.zeros_like(packed), packed[None])
     return slots, columns
 
@@ -90,9 +90,9 @@ def count_set(packed: UInt8[np.ndarray, "..."]) -> int:
 
 @njit
 def digit_order(room, count, most):
-    """Sort integer keys (0 <= key < `most`) by a stable radix sort, and return the sorting order.
+    """Return the order that sorts integer keys (0 <= key < `most`). The sort is stable.
 
-    The keys are in the first row of `room`, an int64 array of shape (4, count or more) that is overwritten.
+    The keys are in row 0 of `room`, an int64 array of shape (4, count or more). `room` is overwritten.
     """
     keys, numbers, other_keys, other_numbers = room[0], room[1], room[2], room[3]
     bits = 1

@@ -1,4 +1,4 @@
-"""Table of the causes of findings, which is read from the file causes.toml in this folder."""
+"""Table of the causes of findings, read from causes.toml."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from mdnum.plain import beside
 
 @dataclass(frozen=True)
 class Cause:
-    """Consequences of the cause of a finding, alternative causes, and tests that distinguish the causes."""
+    """Cause of a finding: its consequences, alternatives, and tests that distinguish them."""
 
     brings: tuple[str, ...] = ()  # codes of findings that it explains
     rivals: tuple[str, ...] = ()  # codes of other causes that show the same
@@ -42,16 +42,16 @@ _SEVERITIES = ("info", "warning", "error")
 
 
 def cause(code: str) -> Cause:
-    """Return the row of the cause table for a finding code; codes of other packages have an empty row."""
+    """Return the cause of a finding code. Codes of other packages have an empty cause."""
     return CAUSES.get(code, Cause())
 
 
 def heads(findings: Sequence[tuple[str, str]]) -> list[int]:
-    """For each finding, return the index of the finding that explains it, or its own index if none does.
+    """For each finding, return the index of the finding that explains it, or its own index.
 
-    A finding is listed under its deepest cause that is at least as severe as the finding. A finding without a
-    cause of this severity is listed under the first finding with the same code. A common cause of several
-    findings is likely but not proven. Correct the finding that is listed first, and then repeat the audit.
+    A finding is listed under its deepest cause that is at least as severe. Without such a cause, it is listed
+    under the first finding with the same code. A common cause of several findings is likely but not proven.
+    Correct the finding that is listed first, and then repeat the audit.
 
     Args:
         findings: code and severity of each finding, in the order in which the findings were made.

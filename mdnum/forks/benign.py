@@ -1,16 +1,14 @@
-"""Test whether a fork is benign, that is, whether two programs with diverging runs give the same averages.
+"""Test whether two programs whose runs diverge give the same averages.
 
-Runs of program B are compared with an ensemble of runs of program A at a step that is found by a calibration.
-At early steps, rounding errors can change a run by more than the runs of the ensemble differ from each other.
-At late steps, no run depends on its initial state any more, and a changed program has the same scatter as the
-ensemble. The steps suitable for a comparison depend on the system. For calibration, programs with deliberate
-changes are run; at the chosen step, all deliberate changes are distinguishable from rounding.
+Runs of program B are compared with an ensemble of program A at a calibrated step. At early steps, rounding
+errors can exceed the scatter of the ensemble. At late steps, no run depends on its initial state any more.
+The steps suitable for a comparison depend on the system. In the calibration, programs are deliberately
+changed. At the chosen step, all changes are distinguishable from rounding.
 
-The test follows the ensemble-consistency tests of climate models (Baker et al. 2015; Milroy et al. 2018).
-Features (measured quantities) are standardized by the ensemble and projected onto its principal components. A
-run is an outlier if at least two of its principal components exceed the outlier limit. A program fails the
-test if at least two of its three runs are outliers. Equivalently, a program fails if the median of the
-second-largest principal component over its three runs exceeds the limit.
+The test follows those of climate models (Baker et al. 2015; Milroy et al. 2018). Measured quantities
+(features) are standardized and projected onto principal components of the ensemble. A run is an outlier if at
+least two of its components exceed the limit. A program fails the test if at least two of its three runs are
+outliers. In other words, the median of its runs' second-largest components exceeds the limit.
 """
 
 from __future__ import annotations
@@ -77,7 +75,7 @@ class Space:
 
     @classmethod
     def of(cls, features: Float[np.ndarray, "runs features"]) -> Space:
-        """Compute 2 to 10 principal components, which explain most of the variance of the features."""
+        """Compute 2 to 10 principal components of the features."""
         mean, spread = features.mean(axis=0), features.std(axis=0, ddof=1)
         # nothing can be said of a feature that is constant, such as a distance that no pair has
         spread = np.where(spread > _ROUNDING * np.abs(mean), spread, np.inf)
@@ -92,27 +90,27 @@ class Space:
     def standardized(
         self, features: Float[np.ndarray, "*runs features"]
     ) -> Float[np.ndarray, "*runs features"]:
-        """Return the features of runs in units of the standard deviations of the ensemble."""
+        """Return the features in units of the ensemble's standard deviations."""
         return (features - self.mean) / self.spread
 
     def scores(self, features: Float[np.ndarray, "runs features"]) -> Float[np.ndarray, "runs components"]:
-        """Return principal components in units of their standard deviations; NaN for a run that blew up."""
+        """Return principal components in units of their standard deviations. NaN for a run that blew up."""
         return self.standardized(features) @ self.axes.T / self.sigma
 
     def second(self, features: Float[np.ndarray, "runs features"]) -> Float[np.ndarray, "runs"]:
-        """Return the second-largest principal component of each run; above the limit, the run is an outlier.
+        """Return the second-largest principal component of each run.
 
-        For a run that blew up, the result is infinity, so the run is always an outlier.
+        A run that blew up has the result infinity.
         """
         scores = np.abs(self.scores(features))
         return np.sort(np.where(np.isnan(scores), np.inf, scores), axis=1)[:, -2]
 
 
 def limit_of(features: Float[np.ndarray, "runs features"]) -> float:
-    """Return the number of standard deviations above which a principal component counts as an outlier.
+    """Return the limit above which a principal component is an outlier.
 
-    The outlier limit is two standard deviations, or more if over a tenth of the ensemble would be outliers.
-    Principal components for a run are computed from other runs, as a run influences its own.
+    The limit is two standard deviations, or more if over a tenth of the ensemble would be outliers. The
+    components of a run are computed from other runs, since a run influences its own.
     """
     seconds = np.empty(len(features))
     for fold in range(min(_FOLDS, len(features))):
@@ -122,18 +120,18 @@ def limit_of(features: Float[np.ndarray, "runs features"]) -> float:
 
 
 def triples(seconds: Float[np.ndarray, "runs"]) -> Float[np.ndarray, "tries"]:
-    """Return the median of the second-largest principal component for each group of three successive runs."""
+    """Return the median of the second-largest component for each three successive runs."""
     tries = len(seconds) // RUNS
     return np.median(seconds[: RUNS * tries].reshape(tries, RUNS), axis=1)
 
 
 def two_of_three(rate: float) -> float:
-    """Return the probability that two or all of three runs are outliers, given the probability for one."""
+    """Return the probability that at least two of three runs are outliers."""
     return 3 * rate**2 - 2 * rate**3
 
 
 def bounds(count: int, of: int) -> tuple[float, float]:
-    """Compute the exact (Clopper-Pearson) 95 % confidence interval of a rate, from `count` of `of` trials."""
+    """Compute the exact (Clopper-Pearson) 95 % confidence interval of a rate, `count` of `of`."""
     tail = 0.025
     low = betaincinv(count, of - count + 1, tail) if count else 0.0
     high = betaincinv(count + 1, of - count, 1 - tail) if count < of else 1.0
@@ -156,7 +154,7 @@ class Planted:
 
     @property
     def ok(self) -> bool:
-        """True if a harmful change always failed the test, or if a harmless change failed only by chance."""
+        """True if a harmful change always failed, or if a harmless change failed only by chance."""
         if self.must_fail:
             return self.failures == self.tries
         return bounds(self.failures, self.tries)[0] <= ACCEPTED
@@ -164,7 +162,7 @@ class Planted:
 
 @dataclass(frozen=True)
 class Window:
-    """A step at which runs can be compared, and the principal components and outlier limit at this step."""
+    """A step at which runs can be compared, with the outlier limit at this step."""
 
     step: int  # of the comparison
     space: Space  # components of the ensemble
@@ -173,7 +171,7 @@ class Window:
 
     @property
     def power(self) -> float:
-        """Smallest score/limit ratio of deliberate changes that must be detected; infinity if none exist."""
+        """Smallest score/limit ratio of deliberate changes that must be detected. Infinity if none exist."""
         return min((score for one in self.table if one.must_fail for score in one.scores), default=np.inf)
 
     @property
@@ -195,7 +193,7 @@ class Calibration:
 
     @property
     def rate(self) -> float:
-        """Probability of a false positive, estimated from runs of the same program outside the ensemble."""
+        """Rate of false positives, from runs of the same program outside the ensemble."""
         return two_of_three(self.alone / self.held_out) if self.held_out else float("nan")
 
     @property
@@ -216,7 +214,7 @@ def calibrate(
     changes: Sequence[Change] | None = None,
     progress: Progress | None = None,
 ) -> Calibration:
-    """Run an ensemble, and find the step at which deliberate changes are distinguishable from rounding.
+    """Run an ensemble, and find the step at which deliberate changes can be detected.
 
     Args:
         simulation: the simulation of which an ensemble is run.
@@ -285,7 +283,7 @@ def calibrate(
 
 
 def choose(windows: Sequence[Window], name: str) -> Window:
-    """Return the latest step at which all deliberate changes are well detected, or the most sensitive step.
+    """Return the latest step at which all deliberate changes are detected well, or the most sensitive step.
 
     Raises:
         InputError: at no step are the deliberate changes distinguishable from rounding.
@@ -324,7 +322,7 @@ def _windows(simulation: Simulation, start: Start | None) -> list[int]:
 
 @result
 class Benign:
-    """Whether runs of program B are statistically consistent with an ensemble of runs of program A."""
+    """Whether runs of program B agree statistically with runs of program A."""
 
     passed: bool  # whether they do
     window: int  # step of the comparison
@@ -355,8 +353,8 @@ def benign(
 ) -> Benign:
     """Compare three runs of program B with an ensemble of runs of program A.
 
-    Program B fails if at least two principal components exceed the outlier limit in two of three runs. If B
-    passes, replacing A by B has no larger effect than the smallest perturbation of the initial state.
+    B fails if two principal components exceed the outlier limit in two of three runs. A program that passes
+    has no larger effect than the smallest perturbation of the initial state.
 
     Args:
         twin: the programs. Atom labels and axes of B do not matter, because no feature depends on them.
@@ -382,7 +380,7 @@ def benign(
 
 
 def _check(twin: Twin) -> None:
-    """Raise an error if an ensemble of one program cannot be used to test another program."""
+    """Raise an error if two programs cannot be compared."""
     twin.a.check(twin.b)
     keys = [one.simulation.integrator.random for one in (twin.a, twin.b)]
     a, b = (() if key is None else np.asarray(jax.random.key_data(key)) for key in keys)
@@ -395,7 +393,7 @@ def _check(twin: Twin) -> None:
 
 
 def _failing(calibration: Calibration, rows: np.ndarray, scores: np.ndarray) -> dict[str, float]:
-    """Return the features that contribute most to the principal components that exceed the limit."""
+    """Return the features that contribute most to components above the limit."""
     space, limit = calibration.window.space, calibration.window.limit
     z = np.median(space.standardized(rows), axis=0)
     middle = np.median(scores, axis=0)

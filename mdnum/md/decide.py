@@ -1,7 +1,7 @@
-"""Decisions on which pairs are inside the cutoff, by the comparison that the system file specifies.
+"""Decisions which pairs are inside the cutoff.
 
 Only this module defines the compared quantity and its threshold. The force loop, the check of neighbor lists
-and the writer of the ledger therefore make the same decision on each pair.
+and the ledger therefore make the same decisions.
 """
 
 from __future__ import annotations
@@ -44,7 +44,7 @@ CONVENTIONS = ("r2 <", "r2 <=", "r <", "r <=")
 
 @dataclass(frozen=True)
 class PairDecider:
-    """Decision whether a pair is inside: `r2 < r_cut²`, `r2 <= r_cut²`, `r < r_cut` or `r <= r_cut`."""
+    """Rule for pairs inside the cutoff: `r2 < r_cut²`, `r2 <= r_cut²`, `r < r_cut` or `r <= r_cut`."""
 
     r_cut: tuple[float, ...]  # cutoff of each pair type, length
     compare: str = "r2 <"  # quantity and comparison, one of "r2 <", "r2 <=", "r <", "r <="
@@ -58,17 +58,17 @@ class PairDecider:
 
     @property
     def convention(self) -> PairDecider:
-        """The decision rule without cutoff radii and error bounds, as static data for compiled programs."""
+        """The decision rule without radii and error bounds, as static data."""
         return replace(self, r_cut=(), reach=_NO_REACH, state="float64")
 
     @property
     def space(self) -> str:
-        """The quantity that is compared with the threshold: "r" (distance) or "r2" (squared distance)."""
+        """The quantity compared with the threshold: "r" (distance) or "r2" (squared distance)."""
         return self.compare.split()[0]
 
     @property
     def thresholds(self) -> tuple[Threshold, ...]:
-        """Thresholds by pair type, in the dtype of the comparison; a threshold is r_cut or its square."""
+        """Thresholds (r_cut or its square) by pair type, in the dtype of the comparison."""
         scalar = np.dtype(self.dtype).type
         comparison = self.compare.split()[1]
         values = [scalar(r) * scalar(r) if self.space == "r2" else scalar(r) for r in self.r_cut]
@@ -76,17 +76,17 @@ class PairDecider:
 
     @property
     def exact_thresholds(self) -> tuple[float, ...]:
-        """Thresholds by pair type in double precision, before rounding to the dtype of the comparison."""
+        """Thresholds by pair type in double precision, before rounding."""
         return tuple(threshold.value for threshold in replace(self, dtype="float64").thresholds)
 
     @cached_property
     def bounds(self) -> tuple[float, ...]:
-        """Bounds on |computed margin - exact margin| by pair type, in units of the compared r or r².
+        """Bounds on |computed margin - exact margin| by pair type, in units of r or r².
 
-        The exact margin follows, without rounding, from stored positions and the double-precision box and
-        threshold. For the error analysis, see numerics.rounding. The error bound is computed for a pair
-        distance of 1.001 r_cut, and holds for shorter distances. For longer distances, the decision is right,
-        or |margin| is below the bound. If coordinates exceed `reach`, `bounds_at` gives valid bounds.
+        The exact margin follows from stored positions, without rounding. For the error analysis, see
+        numerics.rounding. The error bound holds for distances up to 1.001 r_cut. For longer distances, the
+        decision is right, or |margin| is below the bound. If coordinates exceed `reach`, `bounds_at` gives
+        valid bounds.
         """
         return tuple(float(bound) for bound in self._bounds(None))
 
@@ -97,7 +97,7 @@ class PairDecider:
         return narrows and len(self.reach.lattice) < 3
 
     def bounds_at(self, x: Float[np.ndarray, "rows 3 atoms"]) -> Float[np.ndarray, "rows types"]:
-        """Return error bounds of margins for several states; coordinates beyond `reach` have larger bounds.
+        """Return error bounds of margins for several states. Coordinates beyond `reach` have larger bounds.
 
         The rounding error of a position increases with its magnitude. Positions are not wrapped along
         nonperiodic axes.
@@ -115,7 +115,7 @@ class PairDecider:
         return bounds
 
     def _bounds(self, seen: Float[np.ndarray, "rows 3"] | None) -> list:
-        """Return error bounds of margins by pair type, for coordinates up to max(`reach`, `seen`)."""
+        """Return error bounds of margins for coordinates up to max(`reach`, `seen`)."""
         bound = squared_distance_bound if self.space == "r2" else distance_bound
         given = self.reach, np.dtype(self.dtype), np.dtype(self.state), seen
         return [
@@ -124,21 +124,21 @@ class PairDecider:
         ]
 
     def values(self) -> jax.Array:
-        """Return the thresholds as an array of the dtype of the decision, shape (types,)."""
+        """Return the thresholds in the dtype of the decision, shape (types,)."""
         return jax.device_put(np.array([t.value for t in self.thresholds], np.dtype(self.dtype)))
 
     def quantity(self, dx, dy, dz, zero: jax.Array) -> jax.Array:
-        """Return the compared quantity, r or r², inside jit, with the same bits as `host_quantity`."""
+        """Return r or r² inside jit, with the same bits as `host_quantity`."""
         r2 = squared_norm(dx, dy, dz, zero)
         return root(r2) if self.space == "r" else r2
 
     def host_quantity(self, dx, dy, dz) -> Float[np.ndarray, "..."]:
-        """Return, on the host, the compared quantity (r or r²) of displacements in the decision's dtype."""
+        """Return r or r² of displacements in the decision's dtype, on the host."""
         r2 = dx * dx + dy * dy + dz * dz
         return np.sqrt(r2) if self.space == "r" else r2
 
     def host_margin(self, displacement, kind) -> Float[np.ndarray, "..."]:
-        """Return, on the host, margins (threshold minus r or r²) with the same bits as in the decisions.
+        """Return margins (threshold minus r or r²) on the host, with the same bits as in the decisions.
 
         Args:
             displacement: three components, in the dtype of the decision. kind: pair type of each pair.
@@ -147,7 +147,7 @@ class PairDecider:
         return thresholds[kind] - self.host_quantity(*displacement).astype(np.float64)
 
     def inside(self, quantity, value):
-        """Return True for pairs inside the cutoff, given r or r² and thresholds (jax or numpy arrays)."""
+        """Return True for pairs inside the cutoff, given r or r² and thresholds."""
         return quantity <= value if self.compare.endswith("<=") else quantity < value
 
 
@@ -165,14 +165,14 @@ class Tables(NamedTuple):
     edges: Int[Array, "first second"] | None = None
 
     def groups(self) -> tuple[Int[Array, "groups 4 atoms"], UInt8[Array, "groups 4 atoms"] | None]:
-        """Return neighbor indices and pair types from the neighbor list, in groups of GROUP entries."""
+        """Return neighbor indices and pair types in groups of GROUP entries."""
         atoms = self.index.shape[-1]
         types = None if self.types is None else self.types.reshape(-1, GROUP, atoms)
         return self.index.reshape(-1, GROUP, atoms), types
 
 
 class Decisions(NamedTuple):
-    """Decisions for all pairs of a neighbor list, from one pass over the list."""
+    """Decisions for all pairs of a neighbor list."""
 
     bits: UInt8[Array, "words atoms"]  # decisions, eight slots to a byte, shape (slots/8, atoms)
     # smallest |margin| of any listed pair, in the quantity's space. Only where it is within the rounding
@@ -181,12 +181,12 @@ class Decisions(NamedTuple):
 
 
 def packed(halves: UInt8[Array, "groups atoms"]) -> UInt8[Array, "words atoms"]:
-    """Pack cutoff decisions into bytes; each byte contains the decisions on two groups of neighbors."""
+    """Pack cutoff decisions into bytes, two groups of neighbors per byte."""
     return halves[0::2] | (halves[1::2] << jnp.uint8(GROUP))
 
 
 def halves_of(bits: UInt8[Array, "words atoms"]) -> UInt8[Array, "groups atoms"]:
-    """Unpack each byte into the cutoff decisions of two groups of neighbors: inverse of `packed`."""
+    """Unpack each byte into the decisions of two groups of neighbors. Inverse of `packed`."""
     mask = jnp.uint8((1 << GROUP) - 1)
     return jnp.stack([bits & mask, bits >> jnp.uint8(GROUP)], axis=1).reshape(-1, bits.shape[-1])
 
@@ -199,7 +199,7 @@ def unpacked(half: UInt8[Array, "atoms"]) -> Bool[Array, "4 atoms"]:
 
 
 class SlotJudge:
-    """Decisions on groups of neighbor slots, made inside jit, with the smallest |margin| of each atom.
+    """Decisions on groups of neighbor slots inside jit, and the smallest |margin| of each atom.
 
     Args:
         decider: the comparison that defines a decision.
@@ -229,7 +229,7 @@ class SlotJudge:
         return jnp.full(self.atoms, jnp.inf, self.value.dtype)
 
     def group(self, j, types):
-        """Return displacement, compared quantity, decision and threshold for GROUP neighbors j of every atom.
+        """Return displacement, compared quantity, decision and threshold for GROUP neighbors of every atom.
 
         Args:
             j: neighbors, shape (GROUP, atoms). types: their pair types, or None.
@@ -241,7 +241,7 @@ class SlotJudge:
         return d, quantity, self.decider.inside(quantity, threshold), threshold
 
     def tally(self, nearest, quantity, inside, threshold):
-        """Return the cutoff decisions for a group of neighbors as bits, and each atom's smallest |margin|."""
+        """Return the decisions for a group of neighbors as bits, and each atom's smallest |margin|."""
         bits = jnp.zeros(self.atoms, jnp.uint8)
         margin = jnp.abs(threshold - quantity)
         for k in range(GROUP):
@@ -261,12 +261,12 @@ class SlotJudge:
         return self.finish(nearest, halves)
 
     def finish(self, nearest, halves) -> Decisions:
-        """Return the cutoff decisions for the neighbor list, two groups of neighbors in each byte."""
+        """Return the decisions for the neighbor list, two groups of neighbors per byte."""
         return Decisions(packed(halves), jnp.min(nearest, initial=jnp.inf).astype(jnp.float64))
 
 
 def displacements(components, cell: Cell, j):
-    """Return minimum-image vectors x_j - x_i by component; indices of empty slots become valid indices."""
+    """Return minimum-image vectors x_j - x_i by component. Empty slots get valid indices."""
     return cell.minimum_image(*(c.at[j].get(mode="promise_in_bounds") - c for c in components))
 
 
@@ -274,12 +274,12 @@ def displacements(components, cell: Cell, j):
 
 
 def zeros(shape: int | tuple[int, ...], dtype: Any) -> Array:
-    """Return zeros on the device, without compiling a program for each shape as jnp.zeros does."""
+    """Return zeros on the device, without a compilation for each shape."""
     return jax.device_put(np.zeros(shape, dtype))
 
 
 class Changes(NamedTuple):
-    """Cutoff decisions that changed in several steps; each changed pair of atoms is stored only once."""
+    """Cutoff decisions that changed in several steps. Each changed pair is stored once."""
 
     # row, sorted atoms and whether inside now (plus 2 for each channel before), shape (room, 4)
     pairs: Int[Array, "room 4"]
@@ -294,16 +294,16 @@ class Changes(NamedTuple):
         return cls(zeros((room, 4), np.int32), zeros((room, 12), dtype), zeros(3, np.int64))
 
     def emptied(self) -> Changes:
-        """Return the same buffers, with the number of changed cutoff decisions set to zero."""
+        """Return the same buffers with zero changed decisions."""
         return self._replace(count=jnp.zeros_like(self.count))
 
     @property
     def found(self) -> int:
-        """Number of changed cutoff decisions, including those that did not fit into the buffers."""
+        """Number of changed decisions, also of those beyond the size of the buffers."""
         return int(np.asarray(self.count)[0])
 
     def cut(self) -> Changes:
-        """Return buffers shortened to the number of changes, to reduce the transfer of data to the host."""
+        """Return buffers shortened to the number of changes, for a faster transfer to the host."""
         room = 1 << self.found.bit_length()
         if foreign.known() or room >= len(self.pairs):
             return self
@@ -320,7 +320,7 @@ class Changes(NamedTuple):
         row: Int[Array, ""],
         most: int,
     ) -> tuple[Changes, UInt8[Array, "words atoms"]]:
-        """Append changed decisions to the buffers; return the buffers and decisions, in the same memory.
+        """Append changed decisions to the buffers. Return buffers and decisions, in the same memory.
 
         Args:
             most: largest number of changes recorded per step, on a device other than a CPU. If there are
@@ -411,12 +411,12 @@ _TOGETHER = 128
 
 @njit
 def note(before, bits, index, x, v, row, pairs, ends, count):
-    """Append the decisions that changed in a step to `Changes`; changes beyond the capacity are only counted.
+    """Append the decisions that changed in a step. Changes beyond the capacity are only counted.
 
     The array of previous decisions is overwritten with the present decisions.
 
-    Groups of 64 decisions are processed in blocks, by separate passes that find changes, look up neighbors
-    and store rows. In a single pass, every change would cost a mispredicted branch and a wait for memory.
+    Separate passes over blocks of 64 decisions find changes, look up neighbors and store rows. A single pass
+    is slower: it has a mispredicted branch for every change.
     """
     words, atoms = bits.shape
     size, flat = words * atoms, index.reshape(-1)

@@ -1,8 +1,7 @@
 """Cell-list neighbor search on the host, compiled by numba, for building Verlet lists.
 
-Bins are at least half as wide as the list radius. An axis that is too short for five bins has a single bin,
-so that all atoms along this axis are compared. Distances are minimum-image distances; calling functions
-reject radii larger than half the smallest perpendicular width.
+Bins are at least half as wide as the list radius. An axis that is too short for five bins has a single bin.
+Distances are minimum-image distances. The radius must not exceed half the smallest perpendicular width.
 """
 
 from __future__ import annotations
@@ -34,7 +33,7 @@ _MOST_BINS = 1e9
 
 @njit
 def _bin_atoms(fractional, bins, bin_of, start, order):
-    """Sort atoms by bin (counting sort), keeping the order of atoms within a bin."""
+    """Sort atoms by bin. Atoms of a bin keep their order."""
     n = fractional.shape[1]
     for i in range(n):
         b = 0
@@ -56,7 +55,7 @@ def _bin_atoms(fractional, bins, bin_of, start, order):
 
 @njit
 def _layered(x, start, bins):
-    """Sort atoms into layers along the third axis, with contiguous bins along the second axis.
+    """Sort atoms into layers along the third axis. Bins are contiguous along the second axis.
 
     Returns:
         positions, labels, start of each bin and end of the last bin.
@@ -81,7 +80,7 @@ def _layered(x, start, bins):
 
 @njit
 def _runs(b0, b1, box, run, shift):
-    """Find ranges of bins near a column of bins in a layer, and the lattice vector that shifts each range.
+    """Find the bins near a column of bins in a layer, and their lattice vectors.
 
     Returns:
         number of ranges, and the range that contains the column. run: index along the first axis, first and
@@ -113,7 +112,7 @@ def _runs(b0, b1, box, run, shift):
 
 @njit
 def _gather(layered, b1, run, shift, found, box, near, label, begin, home):
-    """Copy the atoms near a column of bins, layer by layer, shifted by lattice vectors to nearby images.
+    """Copy the atoms near a column of bins, shifted to their nearby images.
 
     The neighborhood of a bin consists of contiguous layers around its own layer. Every atom is therefore
     copied only once for a whole column of bins.
@@ -160,7 +159,7 @@ def _gather(layered, b1, run, shift, found, box, near, label, begin, home):
 
 @njit
 def _within(x, y, z, xi, yi, zi, r2_list, mask):
-    """Set the mask that marks candidate atoms within the list radius of an atom."""
+    """Mark the candidates within the list radius of an atom."""
     for k in range(len(x)):
         dx, dy, dz = x[k] - xi, y[k] - yi, z[k] - zi
         mask[k] = dx * dx + dy * dy + dz * dz <= r2_list
@@ -168,7 +167,7 @@ def _within(x, y, z, xi, yi, zi, r2_list, mask):
 
 @njit
 def _images_within(x, y, z, xi, yi, zi, matrix, inverse, r2_list, mask):
-    """Set the mask that marks candidates within the list radius, in a box with a single bin along an axis."""
+    """Mark the candidates within the list radius, in a box with a single bin along an axis."""
     for k in range(len(x)):
         dx, dy, dz = x[k] - xi, y[k] - yi, z[k] - zi
         f = np.rint(dx * inverse[0, 0] + dy * inverse[1, 0] + dz * inverse[2, 0])
@@ -182,7 +181,7 @@ def _images_within(x, y, z, xi, yi, zi, matrix, inverse, r2_list, mask):
 
 @njit
 def _compressed(mask, label, first, atoms, out, place):
-    """Write the labels of the atoms that the mask selects; return the number of labels."""
+    """Write the labels of the marked atoms. Return their number."""
     filled = place
     for k in range(0, atoms, EIGHT):
         filled = kept(mask, k, label, first + k, out, filled)
@@ -191,7 +190,7 @@ def _compressed(mask, label, first, atoms, out, place):
 
 @njit
 def _transposed(rows, table, first, begin, end):
-    """Copy the neighbors of many consecutive atoms to the table at once, to write whole cache lines."""
+    """Copy the neighbors of many consecutive atoms to the table at once."""
     room, n = table.shape
     if end - begin == _TOGETHER and room % EIGHT == 0:
         for k in range(0, room, EIGHT):
@@ -205,7 +204,7 @@ def _transposed(rows, table, first, begin, end):
 
 @njit
 def _fill(x, layered, box, inverse, start, r2_list, table, columns):
-    """Write the neighbors of all atoms in a range of columns of bins; atoms are sorted by bin.
+    """Write the neighbors of all atoms in a range of columns of bins.
 
     Returns:
         the largest number of neighbors, which may exceed the capacity.
@@ -258,7 +257,7 @@ def _fill(x, layered, box, inverse, start, r2_list, table, columns):
 
 
 def grid(cell: Cell, fractional_extent, r_list: float, atoms: int):
-    """Return the number of bins along each axis, and the search range as a number of bins."""
+    """Return the number of bins along each axis, and the search range in bins."""
     bins = np.ones(3, np.int64)
     reach = np.zeros(3, np.int64)
     for k in range(3):
@@ -277,7 +276,7 @@ def grid(cell: Cell, fractional_extent, r_list: float, atoms: int):
 def neighbor_table(
     positions: Float[np.ndarray, "atoms 3"], cell: Cell, r_list: float, room: int
 ) -> tuple[Int[np.ndarray, "room atoms"], Int[np.ndarray, "atoms"], int]:
-    """Find all neighbors within r_list of every atom, in both directions, with atoms sorted by bin.
+    """Find all neighbors within r_list of every atom, in both directions.
 
     Args:
         positions: wrapped positions, length.
@@ -348,9 +347,9 @@ _using = threading.Lock()
 
 
 def _table(room: int, atoms: int) -> Int[np.ndarray, "room atoms"]:
-    """Return aligned memory for a table of neighbors, which XLA on a CPU can use without making a copy.
+    """Return memory for a table of neighbors that XLA on a CPU uses without a copy.
 
-    For a million atoms, the table needs half a gigabyte, and its allocation takes longer than a search.
+    The table of a million atoms needs half a gigabyte. Its allocation takes longer than a search.
     """
     size = 4 * room * atoms + 64
     with _using:
@@ -364,5 +363,5 @@ def _table(room: int, atoms: int) -> Int[np.ndarray, "room atoms"]:
 
 
 def free_extent(cell: Cell, low: float, high: float) -> float:
-    """Return the extent of the atoms along a nonperiodic axis; 0 (a single bin) in a tilted box."""
+    """Return the extent of the atoms along a nonperiodic axis. 0 (a single bin) in a tilted box."""
     return float(high - low) if cell.orthorhombic or not any(cell.pbc) else 0.0

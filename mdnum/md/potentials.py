@@ -34,12 +34,12 @@ else:
 
 
 def of_type(leaf: Num[Array, "types"], types: Integer[Array, "..."] | None) -> Num[Array, "..."]:
-    """Return the array entries of given pair types (`None` if there is only one), without bounds checks."""
+    """Return the array entries of given pair types, without bounds checks. None: there is only one type."""
     return leaf[0] if types is None else leaf.at[types].get(mode="promise_in_bounds")
 
 
 class PairPotential(eqx.Module):
-    """Base class of pair potentials without a cutoff; its fields are parameters with one entry per pair type.
+    """Base class of pair potentials without a cutoff. Its fields are the parameters, one entry per pair type.
 
     Example:
         >>> class Inverse(mdnum.PairPotential):
@@ -58,7 +58,7 @@ class PairPotential(eqx.Module):
 
     @abstractmethod
     def evaluate(self, r2: Float[Array, "..."]) -> tuple[Float[Array, "..."], Float[Array, "..."]]:
-        """Return energy u and slope du/d(r²) at squared distances; parameters are broadcast against r2."""
+        """Return energy u and slope du/d(r²) at squared distances. Parameters broadcast against r2."""
 
     def reference(
         self, r: Float[np.ndarray, "pairs"], **constants: Any
@@ -75,17 +75,17 @@ class PairPotential(eqx.Module):
         return np.asarray(energy), np.asarray(slope)
 
     def of(self, types: Integer[Array, "..."] | None) -> PairPotential:
-        """Return the potential with the parameters of given pair types (None for a single type)."""
+        """Return the potential of given pair types. None for a single type."""
         own, shared = self.typed.split()
         return eqx.combine(jax.tree.map(lambda leaf: of_type(leaf, types), own), shared)
 
     @property
     def typed(self) -> PairPotential:
-        """The potential with every per-species parameter as two values per pair type, one for each atom."""
+        """The potential with every per-species parameter as two values per pair type."""
         return self
 
     def split(self) -> tuple[Any, Any]:
-        """Return two copies: one with only per-pair-type parameters, and one with only shared parameters."""
+        """Return two copies. One has the parameters per pair type, the other the shared parameters."""
         return self, jax.tree.map(lambda _: None, self)
 
     @property
@@ -98,7 +98,7 @@ class PairPotential(eqx.Module):
         return replace(self, **leaves)
 
     def constants(self, kind: int) -> dict[str, Any]:
-        """Return the parameters of one pair type, with two values of each per-species parameter."""
+        """Return the parameters of one pair type. A per-species parameter has two values."""
         return jax.tree.map(lambda leaf: float(leaf[kind]), dict(self.typed.leaves))
 
 
@@ -273,7 +273,7 @@ class PairFunction(PairPotential):
 
 
 def _is_by_type(value: Any) -> bool:
-    """Return True for a parameter that is one number, or has a number for each pair of species."""
+    """Return True if a parameter is one number or has a number per pair of species."""
     if isinstance(value, Mapping):
         return bool(value) and all(isinstance(key, str) and "-" in key for key in value)
     return isinstance(value, int | float | np.generic) or (eqx.is_array_like(value) and np.ndim(value) == 0)
@@ -300,7 +300,7 @@ for _potential in (LennardJones, Morse, SoftSphere):
 
 
 class SumPotential(PairPotential):
-    """Potential terms that share one cutoff decision per pair; energies and slopes are tuples over terms."""
+    """Sum of potential terms with the same cutoff decision for each pair. Energies and slopes are tuples."""
 
     names: tuple[str, ...] = eqx.field(static=True)
     parts: tuple[PairPotential, ...]
@@ -322,7 +322,7 @@ class SumPotential(PairPotential):
 
 
 class Together(Cutoff):
-    """Cutoffs of terms with one common decision per pair; onsets, energies and slopes are given by term."""
+    """Cutoffs of terms with the same cutoff decision for each pair."""
 
     def __init__(self, ends: tuple[Cutoff, ...]):
         self.ends = ends
@@ -336,7 +336,7 @@ class Together(Cutoff):
         return zip(self.ends, (AtCutoff(at.r_cut, *own) for own in rest), strict=True)
 
     def cut(self, r2, u, w, at, weights=None):
-        """Return the sum of `Cutoff.cut` over all terms, each times its weight (1 if `weights` is None)."""
+        """Return the sum of `Cutoff.cut` over all terms, each times its weight (default 1)."""
         rows = zip(self._each(at), u, w, strict=True)
         made: list[Any] = [end.cut(r2, energy, slope, own) for (end, own), energy, slope in rows]
         for k, weight in enumerate(weights or ()):
@@ -348,7 +348,7 @@ class Together(Cutoff):
 
 
 class CutPotential(eqx.Module):
-    """Pair potential with its cutoff, or a sum of pair potentials that share one cutoff decision per pair."""
+    """Pair potential with a cutoff, or a sum with the same cutoff decision for each pair."""
 
     potential: PairPotential  # bare potential, parameters per pair type
     cutoff: Cutoff = eqx.field(static=True)  # how it ends
@@ -370,12 +370,12 @@ class CutPotential(eqx.Module):
 
     @property
     def parts(self) -> tuple[CutPotential, ...]:
-        """Potentials of all channels, one for each cutoff radius; a `CutPotential` has only one channel."""
+        """Potentials of all channels, one per cutoff radius. A `CutPotential` has one channel."""
         return (self,)
 
     @property
     def rows(self) -> list[tuple[str, PairPotential, Cutoff, Any, Any]]:
-        """All terms: name ("" for a single term), bare potential, cutoff, onset, and weights (or None)."""
+        """All terms: name ("" for a single term), potential, cutoff, onset, and weights (or None)."""
         # eqx.tree_at looks at a tree whose empty tuples are leaves
         weights = self.weights if isinstance(self.weights, tuple) else ()
         if not isinstance(self.potential, SumPotential) or not isinstance(self.cutoff, Together):
@@ -386,7 +386,7 @@ class CutPotential(eqx.Module):
 
     @property
     def terms(self) -> dict[str, CutPotential]:
-        """Terms of the potential by name, with their weights; a single potential is one term named ""."""
+        """Terms of the potential by name, with their weights. A single potential has the name ""."""
         return {
             name: CutPotential(part, end, self.r_cut, onset, () if weight is None else (weight,))
             for name, part, end, onset, weight in self.rows
@@ -399,7 +399,7 @@ class CutPotential(eqx.Module):
 
     @property
     def typed(self) -> CutPotential:
-        """The potential with every per-species parameter as two values per pair type, one for each atom."""
+        """The potential with every per-species parameter as two values per pair type."""
         return replace(self, potential=self.potential.typed)
 
     def at_cutoff(self) -> AtCutoff:
@@ -408,7 +408,7 @@ class CutPotential(eqx.Module):
         return AtCutoff(self.r_cut, self.r_onset, energy, jax.tree.map(lambda w: 2 * self.r_cut * w, w))
 
     def evaluate(self, r2, types, at: AtCutoff, *weights):
-        """Return the energy u and du/d(r²) of pairs inside the cutoff, by pair type.
+        """Return the energy u and du/d(r²) of pairs inside the cutoff.
 
         Args:
             r2: squared distances.
@@ -421,7 +421,7 @@ class CutPotential(eqx.Module):
         return self.cutoff.cut(r2, u, w, here, *weights)
 
     def jumps(self) -> Float[np.ndarray, "2 terms types"]:
-        """Return jumps of energy and radial force at the cutoff, for weights of 1, by term and pair type."""
+        """Return jumps of energy and radial force at the cutoff, by term and pair type."""
         # in numpy: to jax each operation on these few numbers is a program to compile
         made = self.cutoff.jumps(jax.tree.map(np.asarray, self).at_cutoff())
         return np.array(made).swapaxes(0, 1)
@@ -432,7 +432,7 @@ class CutPotential(eqx.Module):
 
 
 class Channels(eqx.Module):
-    """Sum of pair potentials with different cutoff radii; each pair has one cutoff decision for each radius.
+    """Sum of pair potentials with different cutoff radii. Each pair has one cutoff decision per radius.
 
     Cutoff decisions are numbered consecutively over the pair types of all radii (channels).
     """
@@ -441,7 +441,7 @@ class Channels(eqx.Module):
 
     @classmethod
     def of_terms(cls, terms: Mapping[str, CutPotential], *, apart: bool = False) -> CutPotential | Channels:
-        """Combine terms given by name; terms with equal cutoff radii share a channel, unless `apart` is true.
+        """Combine terms by name. Terms with equal cutoff radii share a channel, unless `apart` is true.
 
         Raises:
             InputError: the name of a term cannot be used in a key of a system file.
@@ -473,7 +473,7 @@ class Channels(eqx.Module):
 
     @property
     def weights(self) -> tuple[Any, ...]:
-        """Weights of the potential terms of all channels, in the order of the channels."""
+        """Weights of the terms of all channels, in the order of the channels."""
         return tuple(weight for part in self.parts for weight in part.weights)
 
     @property
@@ -482,7 +482,7 @@ class Channels(eqx.Module):
         return jnp.concatenate([part.r_cut for part in self.parts])
 
     def jumps(self) -> Float[np.ndarray, "2 terms kinds"]:
-        """Return energy and radial-force jumps when a pair enters the cutoff, by term, channel and type."""
+        """Return energy and radial-force jumps at the cutoff, by term, channel and type."""
         sides = zip(*(part.jumps() for part in self.parts), strict=True)
         return np.stack([np.asarray(block_diag(*one)) for one in sides])
 
@@ -494,12 +494,12 @@ class Channels(eqx.Module):
 def each_term(
     model: CutPotential | Channels, change: Callable[[CutPotential], CutPotential]
 ) -> CutPotential | Channels:
-    """Return a copy of the potential with a function applied to every term; not for use inside jit."""
+    """Return a copy of the potential with a function applied to every term. Not for use inside jit."""
     made = {name: change(term) for name, term in model.terms.items()}
     return made[""] if "" in made else Channels.of_terms(made)
 
 
 def pair_type(first, second, species: int):
-    """Return the index of an unordered pair of species, counted row by row in the upper triangle."""
+    """Return the index of an unordered pair of species, by rows of the upper triangle."""
     low, high = np.minimum(first, second), np.maximum(first, second)
     return low * species - low * (low - 1) // 2 + (high - low)

@@ -17,7 +17,7 @@ def power(exponent: int) -> str:
 
 
 def number(value: float | None, digits: int = 3, signed: bool = False, whole: bool = True) -> str:
-    """Format a number with significant digits, as a power of ten if far from 1; "–" for None.
+    """Format a number with significant digits. Powers of ten if far from 1, "–" for None.
 
     Args:
         whole: True to write numbers up to a million in full, even with digits beyond the significant ones.
@@ -55,7 +55,7 @@ def plain(value: float | None, digits: int = 4) -> str:
 
 
 def pair_name(pair: Mapping[str, Any]) -> str:
-    """Return the atom labels of a pair, with its potential term if every term has its own cutoff."""
+    """Return the atom labels of a pair, and its potential term if terms have own cutoffs."""
     return f"{pair['i']}–{pair['j']}" + (f" ({pair['terms']})" if pair.get("terms") else "")
 
 
@@ -68,7 +68,7 @@ def many(value: float | None, noun: str, plural: str | None = None) -> str:
 
 
 def percent(share: float | None) -> str:
-    """Format a fraction as a percentage that is never rounded to 0 % or 100 %; None means infinity."""
+    """Format a fraction as a percentage that is never rounded to 0 % or 100 %. None means infinity."""
     if share is None or 0 < share < 0.001:
         return "under 0.1 %" if share else "an unbounded share"
     if 0.999 < share < 1:
@@ -77,7 +77,7 @@ def percent(share: float | None) -> str:
 
 
 def typeset(text: str) -> str:
-    """Typeset numbers in program notation, such as -1.5e-16 as −1.5 × 10⁻¹⁶, and 2^15 as 2¹⁵."""
+    """Typeset numbers: -1.5e-16 becomes −1.5 × 10⁻¹⁶, and 2^15 becomes 2¹⁵."""
     text = re.sub(r"(?<![\w.])(\d+(?:\.\d+)?)[eE]([+-]?\d+)(?![\w.]*\w)", _as_power, text)
     text = re.sub(r"(?<=\w)(?:\^|\*\*)(-?\d+)", lambda found: found[1].translate(_RAISED), text)
     text = re.sub(r"\bsqrt\((\w+)\)", r"√\1", text)

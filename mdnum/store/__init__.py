@@ -1,4 +1,4 @@
-"""Storage of a run in a folder: tables, frames, JSON and text files, readable even if the run is killed."""
+"""Storage of a run in a folder. A killed run stays readable."""
 
 from __future__ import annotations
 

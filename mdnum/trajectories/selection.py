@@ -1,4 +1,4 @@
-"""Selection of atoms in any supported trajectory format, in the selection syntax of MDAnalysis."""
+"""Selection of atoms in a trajectory, in the syntax of MDAnalysis."""
 
 from __future__ import annotations
 
@@ -20,9 +20,9 @@ _SHOWN = 8
 
 
 def select(trajectory: Trajectory, words: str) -> Int[np.ndarray, "chosen"]:
-    """Return indices, ascending, of the atoms that match a selection at the first requested frame.
+    """Return the indices of the atoms that match a selection, in ascending order.
 
-    A selection by positions ("around 5 protein") is evaluated only once, at the first frame.
+    A selection by positions ("around 5 protein") is evaluated once, at the first frame.
 
     Raises:
         InputError: the text is not a selection, matches no atom, or needs data that are not in the file.
@@ -52,7 +52,7 @@ def select(trajectory: Trajectory, words: str) -> Int[np.ndarray, "chosen"]:
 
 
 def _universe(trajectory: Trajectory) -> Any:
-    """Return an MDAnalysis Universe at the first requested frame; it computes distances in float32."""
+    """Return an MDAnalysis Universe at the first requested frame. Its distances are float32."""
     from MDAnalysis.lib.mdamath import triclinic_box
 
     first = next(iter(trajectory.frames()), None)
@@ -74,7 +74,7 @@ def _universe(trajectory: Trajectory) -> Any:
 
 
 def _there_are(table: AtomTable) -> str:
-    """List the atom, residue or segment names that occur in a file, for an error message."""
+    """List the names of atoms, residues or segments in a file, for an error message."""
     if not table.named:
         return "the file has no names of atoms"
     words = []

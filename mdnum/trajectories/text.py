@@ -1,13 +1,13 @@
 """Trajectories read through ASE, and readers of text formats that preserve all digits.
 
-This module reads three text formats itself, because other libraries lose information (confirmed by
-tests/trajectories/test_source.py):
+This module reads three text formats itself, because other libraries lose information
+(tests/trajectories/test_source.py):
 
 - LAMMPS's `dump custom` and `dump atom`, with columns x, xu, xs or xsu (docs.lammps.org/dump.html,
-  Howto_triclinic). MDAnalysis would reduce coordinates of dumps to float32 and ignore the tilt of the box.
-- GROMACS's gro files with any number of frames; the distance between decimal points is the column width
-  (manual.gromacs.org, reference manual, file formats). MDAnalysis and ASE read only the first gro frame.
-- Extended XYZ, with ASE called for each frame: otherwise, ASE scans the whole file before the first frame.
+  Howto_triclinic). MDAnalysis reduces the coordinates to float32 and ignores the tilt of the box.
+- GROMACS's gro files. The distance between decimal points is the column width (manual.gromacs.org, reference
+  manual, file formats). MDAnalysis and ASE read only the first gro frame.
+- Extended XYZ, one frame at a time. Otherwise, ASE scans the whole file first.
 """
 
 from __future__ import annotations
@@ -54,7 +54,7 @@ class AseFrames(Trajectory):
         return raw
 
     def _of_atoms(self, first: Any) -> AtomTable:
-        """Return the first frame's table of atoms, and set the units to those of ASE or of an mdnum run."""
+        """Return the atoms of the first frame, and set the units."""
         self._timed = "time" in first.info
         units = METAL
         if self.path.name == "trajectory.traj":
@@ -84,13 +84,13 @@ class AseFrames(Trajectory):
 
 
 def _ids(atoms: Any) -> np.ndarray | None:
-    """Return the ids of the atoms; None if ids are missing or not unique."""
+    """Return the ids of the atoms. None if ids are missing or not unique."""
     ids = atoms.arrays.get("id")
     return ids if ids is not None and ids.ndim == 1 and len(np.unique(ids)) == len(ids) else None
 
 
 class AseTrajectory(AseFrames):
-    """Trajectory read with `ase.io`, frame by frame or, if the format requires it, all frames at once."""
+    """Trajectory read with `ase.io`, if possible frame by frame."""
 
     def __init__(self, path: Path, topology: Topology | None, frames: slice, format: str):
         super().__init__(path, topology, frames)
@@ -137,10 +137,10 @@ def format_of(path: Path) -> str:
 
 
 def refuse_cut_line(lines: Sequence[str], like: Sequence[str] = ()) -> None:
-    """Reject a last line that ends within its last number, which would be read as a different number.
+    """Reject a last line that ends within its last number.
 
-    A missing newline at the end does not prove truncation, since some programs omit the last newline. The
-    number counts as truncated if it has fewer digits than the numbers in the same column of earlier lines.
+    A missing newline at the end is no sign of truncation. A number is truncated if it has fewer digits than
+    the numbers above it.
 
     Args:
         lines: lines of a frame, each of which ends with a number.
@@ -184,7 +184,7 @@ def _is_cut(word: str, others: Sequence[str]) -> bool:
 
 
 def _digits(word: str) -> tuple[int, int, int] | None:
-    """Count the decimals, significant digits and exponent digits (-1: none) of a number; None for a word."""
+    """Count the decimals, significant digits and exponent digits (-1: none) of a number. None for a word."""
     match = _NUMBER.fullmatch(word)
     if match is None:
         return None
@@ -194,7 +194,7 @@ def _digits(word: str) -> tuple[int, int, int] | None:
 
 
 class TextTrajectory(Trajectory):
-    """Base class of text readers; a subclass defines where a frame ends and how a frame is decoded."""
+    """Base class of text readers. A subclass finds the end of a frame and decodes it."""
 
     def __init__(self, path: Path, topology: Topology | None, frames: slice):
         super().__init__(path, topology, frames)
@@ -205,7 +205,7 @@ class TextTrajectory(Trajectory):
 
     @abstractmethod
     def _block(self, lines: Any) -> list[str] | None:
-        """Read the lines of the next frame; return None at the end of the file.
+        """Read the lines of the next frame. None at the end of the file.
 
         Raises:
             ValueError: the lines do not form a frame.
@@ -265,7 +265,7 @@ class ExtxyzTrajectory(AseFrames, TextTrajectory):
 
 
 class XdatcarTrajectory(ExtxyzTrajectory):
-    """Trajectory in VASP's XDATCAR format, where the header is repeated if the cell changes."""
+    """Trajectory in VASP's XDATCAR format. A change of the cell repeats the header."""
 
     format = "vasp-xdatcar"
     # lines with the cell and the atoms, and how many atoms there are
@@ -340,7 +340,7 @@ class LammpsDump(TextTrajectory):
         return Frame(number, time, positions, box, velocities, labels, identified=True)
 
     def _order(self, number: int, columns: list[str], rows: np.ndarray) -> np.ndarray:
-        """Return the indices that sort the rows by id; the set of ids must not change between frames."""
+        """Return the indices that sort the rows by id. All frames must have the same ids."""
         if "id" not in columns:
             message = "the dump has no atom ids, but LAMMPS changes the order of atoms as they move"
             raise self._refused(message, "Write the dump with the column id")
@@ -368,7 +368,7 @@ class LammpsDump(TextTrajectory):
 
 
 def _labels(columns: list[str], rows: np.ndarray) -> np.ndarray | None:
-    """Return the elements of the atoms, or their types if elements are missing; None if both are missing."""
+    """Return the elements of the atoms, or their types. None if both are missing."""
     name = next((one for one in ("element", "type") if one in columns), None)
     return None if name is None else rows[:, columns.index(name)].astype(str)
 
@@ -391,7 +391,7 @@ def _items(block: list[str]) -> dict[str, list[str]]:
 
 
 def _atoms(items: dict[str, list[str]]) -> tuple[list[str], np.ndarray]:
-    """Return the column names, and the values of all atoms as text, with shape (atoms, columns)."""
+    """Return the column names, and the values as text, shape (atoms, columns)."""
     head, *rows = items["ATOMS"]
     columns = head.split()
     words = np.array("".join(rows).split(), dtype=object)
@@ -402,7 +402,7 @@ def _atoms(items: dict[str, list[str]]) -> tuple[list[str], np.ndarray]:
 
 
 def _bounds(items: dict[str, list[str]]) -> Box:
-    """Return the box of a dump frame; its origin is a corner, which moves if the volume changes."""
+    """Return the box of a dump frame. Its origin is a corner of the box."""
     head, *rows = items["BOX BOUNDS"]
     names, words = head.split(), [row.split() for row in rows[:3]]
     pbc, values = np.array([name == "pp" for name in names[-3:]], bool), np.array(words, np.float64)
@@ -431,7 +431,7 @@ _NANOMETER = 10.0
 
 
 class GroTrajectory(TextTrajectory):
-    """Trajectory in a GROMACS gro file, in Å and Å/ps, the units of MDAnalysis."""
+    """Trajectory in a GROMACS gro file, in Å and Å/ps."""
 
     format = "GRO"
     # numbers of the box in the frame before
@@ -481,7 +481,7 @@ class GroTrajectory(TextTrajectory):
 
 
 def _fixed_columns(rows: list[str], width: int, count: int) -> Float[np.ndarray, "atoms numbers"]:
-    """Return the numbers in columns of fixed width, even if no spaces separate the columns."""
+    """Return the numbers in columns of fixed width. They need no spaces between them."""
     size = _HEAD + count * width
     text = np.array([row[:size].ljust(size).encode() for row in rows], dtype=f"S{size}")
     letters = np.frombuffer(text.tobytes(), "S1").reshape(len(rows), size)[:, _HEAD:]
@@ -489,7 +489,7 @@ def _fixed_columns(rows: list[str], width: int, count: int) -> Float[np.ndarray,
 
 
 def _gro_box(line: str) -> Box:
-    """Return the box from a line v1x v2y v3z or v1x v2y v3z v1y v1z v2x v2z v3x v3y; zeros mean no box."""
+    """Return the box from a line v1x v2y v3z or v1x v2y v3z v1y v1z v2x v2z v3x v3y. Zeros mean no box."""
     values = [float(word) * _NANOMETER for word in _box_words(line)]
     if len(values) not in (3, 9):
         raise ValueError(f"the box line of a frame has {len(values)} numbers; expected 3 or 9")
@@ -500,5 +500,5 @@ def _gro_box(line: str) -> Box:
 
 
 def _box_words(line: str) -> list[str]:
-    """Split a box line into numbers with five decimals; numbers above 10 µm are not separated by spaces."""
+    """Split a box line into numbers with five decimals. Spaces between them may be missing."""
     return _TOUCHING.findall(line) if max(map(len, line.split())) > _LONG else line.split()

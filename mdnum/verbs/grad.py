@@ -1,4 +1,4 @@
-"""`mdnum grad`: derivatives of a loss with respect to parameters of a simulation, by several methods."""
+"""`mdnum grad`: derivatives of a loss with respect to parameters."""
 
 from __future__ import annotations
 
@@ -55,7 +55,7 @@ def grad(
     half_step: bool = True,
     **keep: Unpack[Keep],
 ) -> Outcome:
-    """Differentiate a loss of a simulation with respect to parameters, and compare several methods.
+    """Differentiate a loss with respect to parameters by several methods.
 
     Example:
         >>> mdnum.grad("argon/crystal-108", "mean-potential", ["sigma", "cutoff.radius"], steps=200)
@@ -126,7 +126,7 @@ def grad(
 def _problem(
     simulation: Simulation, of: str | None, names: Sequence[str], steps: int | None
 ) -> tuple[Problem, tuple[str, ...]]:
-    """Return the problem to differentiate and the full parameter names; raise an error for invalid names."""
+    """Return the problem and the full parameter names. Raise an error for invalid names."""
     from mdnum.gradients import Problem, parameters
     from mdnum.gradients.losses import LOSSES, NOT_REAL, parse
 
@@ -146,7 +146,7 @@ def _problem(
 def plan(
     problem: Problem, names: Sequence[str], asked: Sequence[str] | None, replicas: int = 0
 ) -> tuple[list[Method], list[dict[str, str]]]:
-    """Return the gradient methods to run, and omitted methods, each with a reason and an option to add it.
+    """Return the gradient methods to run, and the omitted methods with reason and option.
 
     Args:
         asked: names of methods; None for the fast ones.
@@ -179,7 +179,7 @@ def plan(
 
 
 def _too_long(method: Method, problem: Problem, names: int) -> str:
-    """Return the reason why a gradient method is too slow to run by default; "" if it is fast enough."""
+    """Return why a gradient method is too slow to run by default, or ""."""
     runs = getattr(method, "runs", 0) * names + 1
     if runs * problem.simulation.atoms * problem.steps <= AFFORDABLE or runs == 1:
         return ""
@@ -187,7 +187,7 @@ def _too_long(method: Method, problem: Problem, names: int) -> str:
 
 
 def _over(method: Any, replicas: int, horizons: bool = True) -> Method:
-    """Set the number of initial states of a gradient method; methods that use one state are unchanged."""
+    """Set the number of initial states of a gradient method that uses several."""
     if not replicas or not hasattr(method, "replicas"):
         return method
     changed = replace(method, replicas=replace(method.replicas, count=replicas))
@@ -290,7 +290,7 @@ def _not_run(
     asked: int | None, problem: Problem, found: GradientDiagnosis, replicas: int,
     further: Sequence[str], half_step: bool,
 ) -> list[dict[str, str]]:  # fmt: skip
-    """Return a list of results that were not computed, each with the reason and the option that adds it."""
+    """Return the results that were not computed, with reason and option."""
     from mdnum.gradients.diagnose.trust import no_half_step
 
     own, rows = problem.simulation.steps, []
@@ -340,7 +340,7 @@ def _method(found: Gradient) -> dict[str, Any]:
 
 
 def brief(value: Any) -> Any:
-    """Return an array as a number or a short list; for a large array, return the norm and largest entry."""
+    """Return an array as a number or a short list. For a large array, return its norm and largest entry."""
     array = np.asarray(value, np.float64)
     if array.ndim == 0:
         return float(array)
@@ -431,7 +431,7 @@ def _differentiated(system: BallSystem, methods: list[str], answer: Answer) -> N
 
 
 def relative(value: float, right: float) -> float:
-    """Return |value - right| / |right|, or infinity if `right` is 0 and `value` is not 0."""
+    """Return |value - right| / |right|. Infinity if only `right` is 0."""
     if value == right:
         return 0.0
     return abs(value - right) / abs(right) if right else float("inf")

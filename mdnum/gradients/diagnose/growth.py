@@ -1,13 +1,13 @@
-"""Growth of a gradient and of perturbations with the number of steps, and overflow in narrow formats.
+"""Growth of gradients and perturbations with the number of steps.
 
-The cotangent of the state h steps before the last step is the gradient of a run of h steps (horizon h) from
-this state. One reverse pass over T steps therefore gives gradients for all horizons up to T. Each gradient
-belongs to a different start on the same trajectory. Cotangents of a chaotic run span many powers of two.
-Scaling the loss helps if all cotangents are small, but not if their range exceeds that of the narrow format.
+The cotangent of a state is the gradient of a run that starts from this state. One reverse pass over T steps
+therefore gives gradients for all run lengths (horizons) up to T. Each gradient has a different start.
+Cotangents of a chaotic run span many powers of two. Scaling the loss helps only if the narrow format covers
+this range.
 
-The largest singular value of a run's Jacobian bounds the gradient of any loss that depends on the last state.
-Singular values are computed by subspace iteration with a random block of vectors (Halko, Martinsson and Tropp
-2011). The block is orthonormalized after every stretch of steps, to prevent overflow and parallel vectors.
+The largest singular value of a run's Jacobian bounds the gradient of a loss of the last state. Singular
+values are computed by subspace iteration with a random block (Halko, Martinsson and Tropp 2011). The block is
+orthonormalized after every stretch of steps.
 """
 
 from __future__ import annotations
@@ -53,7 +53,7 @@ _RANGE = 30.0
 
 @dataclass(frozen=True)
 class GradientGrowth:
-    """Norms of the gradient for every horizon (number of steps), and their rate of growth."""
+    """Norm of the gradient for every number of steps, and its growth rate."""
 
     # a row for each horizon 0, 1, ..., T, of the state that many steps before the end: `horizon`, `step`,
     # `onto_positions` and `onto_velocities` (norms of the derivatives by all of them), `size` (norm of both,
@@ -73,7 +73,7 @@ class GradientGrowth:
 
 
 class GrowthWatch:
-    """Collector of norms and derivatives at every step of a reverse pass, for `GradientGrowth`."""
+    """Collector of `GradientGrowth` in a reverse pass."""
 
     def __init__(self, simulation: Simulation, names: Sequence[str], steps: int):
         self.simulation, self.names, self.steps = simulation, tuple(names), steps
@@ -110,7 +110,7 @@ class GrowthWatch:
 
     def result(self, whole: dict[str, Float[np.ndarray, "..."]]) -> GradientGrowth:
         """Return the norms of the gradient by horizon, and their growth rate. The last row is the gradient of
-        the whole run; the other rows omit how the loss depends on the first frame.
+        the whole run. The other rows omit how the loss depends on the first frame.
         """
         units = self.simulation.units
         timestep = float(self.simulation.integrator.timestep)
@@ -141,7 +141,7 @@ class GrowthWatch:
 
 
 def _word(speed: Float[np.ndarray, "rows"], grows: bool) -> str:
-    """Return the word from WORDS that tells whether the gradient and the rms speed stay bounded."""
+    """Return whether the gradient and the rms speed stay bounded, as a word from WORDS."""
     usual = float(np.median(speed))
     if usual > 0 and not (np.isfinite(speed).all() and speed.max() <= _WILD * usual):
         return WORDS[2]
@@ -151,7 +151,7 @@ def _word(speed: Float[np.ndarray, "rows"], grows: bool) -> str:
 def growth(
     problem: Problem, names: Sequence[str], *, saltation: bool = True, progress: Progress | None = None
 ) -> GradientGrowth:
-    """Compute the gradient for every horizon (length of the run), from one reverse pass.
+    """Compute the gradient for every number of steps, from one reverse pass.
 
     Raises:
         InputError: a parameter does not exist, or flips were requested without a pair potential.
@@ -167,7 +167,7 @@ def growth(
 
 @dataclass(frozen=True)
 class Scaling:
-    """Overflow and underflow of the cotangents of each step in a narrow floating-point type."""
+    """Overflow and underflow of the cotangents in a narrow float format."""
 
     format: str  # the type, one of numerics.formats
     numbers: int  # in each step
@@ -185,7 +185,7 @@ class Scaling:
 
 
 class ScalingWatch:
-    """Collector of overflow and underflow counts at every step of a reverse pass, for `Scaling`."""
+    """Collector of `Scaling` in a reverse pass."""
 
     def __init__(self, steps: int, format: str = "float16"):
         self.format = formats.format_of(format)
@@ -219,7 +219,7 @@ class ScalingWatch:
             table["largest"][step] = np.inf
 
     def result(self) -> Scaling:
-        """Count cotangents that overflow or underflow, for the unscaled and for the best-scaled loss."""
+        """Count cotangents that overflow or underflow, without and with scaling of the loss."""
         form = self.format
         largest = float(self.table["largest"].max())
         there = self.exponents.sum(axis=1, dtype=np.int64)
@@ -250,9 +250,9 @@ class ScalingWatch:
 
 @dataclass(frozen=True)
 class Spectrum:
-    """Growth of small perturbations of the initial state: singular values of the Jacobian of the whole run.
+    """Singular values of the Jacobian of a whole run.
 
-    The norm of a perturbation includes the velocities, multiplied by the internal time `clock`.
+    The norm includes the velocities, multiplied by the internal time `clock`.
     """
 
     steps: int  # of the run
@@ -273,7 +273,7 @@ class Spectrum:
 
 @dataclass(frozen=True)
 class TangentImage:
-    """Product of a Jacobian and a block of orthonormal vectors, stored as basis @ mixing * exp(log_scale)."""
+    """Product of a Jacobian and orthonormal vectors, stored as basis @ mixing * exp(log_scale)."""
 
     basis: Float[np.ndarray, "coordinates vectors"]  # orthonormal, shape (coordinates, vectors)
     mixing: Float[np.ndarray, "vectors vectors"]  # upper triangular, of size one, shape (vectors, vectors)
@@ -284,9 +284,9 @@ class TangentImage:
 
 
 class Jacobian:
-    """Derivative of the last state with respect to the state of step 0, at fixed decisions.
+    """Derivative of the last state with respect to the first, at fixed decisions.
 
-    The state vector contains all positions, and all velocities multiplied by the internal time `clock`.
+    A state contains all positions, and all velocities times the internal time `clock`.
 
     Raises:
         InputError: a many-body potential, or an integrator that is not a linear `KickDrift`.
@@ -301,7 +301,7 @@ class Jacobian:
         self.coordinates = 6 * tape.simulation.atoms
 
     def image(self, block: Float[np.ndarray, "coordinates vectors"], backward: bool = False) -> TangentImage:
-        """Return the Jacobian times a block of vectors; if `backward`, its transpose times the block."""
+        """Return the Jacobian times vectors. If `backward`, its transpose times vectors."""
         stretches = self.tape.backward() if backward else self.tape.forward()
         vectors, steps = block.shape[1], self.tape.steps
         mixing, log_scale = np.eye(vectors), 0.0
@@ -338,7 +338,7 @@ class Jacobian:
 
 
 def _orthonormal(block):
-    """Return the QR factors of a block of vectors, with the signs chosen so that the diagonal of R is ≥ 0."""
+    """Return the QR factors of a block of vectors. The diagonal of R is ≥ 0."""
     q, r = np.linalg.qr(block)
     signs = np.where(np.diag(r) < 0, -1.0, 1.0)
     return q * signs, signs[:, None] * r
@@ -395,9 +395,9 @@ def spectrum(
     tape: RunTape | None = None,
     progress: Progress | None = None,
 ) -> Spectrum:
-    """Compute singular values of the Jacobian of the whole run, and finite-time Lyapunov exponents.
+    """Compute singular values of the Jacobian of a run, and finite-time Lyapunov exponents.
 
-    Pair decisions are kept as recorded, so the effect of flips on perturbations is not included.
+    The effect of flips on perturbations is not included.
 
     Args:
         values: number of singular values. extra: additional vectors, for faster convergence.
@@ -452,7 +452,7 @@ def spectrum(
 
 
 def _defect(start, there: TangentImage, back: TangentImage) -> float:
-    """Return the relative error of Q' (Phi q) = (Phi' Q)' q, a test of the transposed Jacobian."""
+    """Return the relative error of Q' (Phi q) = (Phi' Q)' q, a test of the transpose."""
     forward = there.mixing
     factor = np.exp(np.clip(back.log_scale - there.log_scale, -600, 600))
     backward = factor * (back.basis @ back.mixing).T @ start
@@ -460,7 +460,7 @@ def _defect(start, there: TangentImage, back: TangentImage) -> float:
 
 
 def _svd(image: TangentImage) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return log singular values and singular vectors (left, right) of a Jacobian restricted to a block."""
+    """Return log singular values and singular vectors (left, right) of a Jacobian on a block."""
     diagonal = image.stretches[-1]
     if diagonal.max() - diagonal.min() > _RANGE:
         # rounding has eaten the small ones in the product; the block is aligned, so its diagonal has them
@@ -472,7 +472,7 @@ def _svd(image: TangentImage) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 
 
 def _residual(jacobian: Jacobian, left, right, log_s) -> np.ndarray:
-    """Return the residual |Phi' u - s v| / s of each pair of singular vectors u and v."""
+    """Return the residual |Phi' u - s v| / s of each pair of singular vectors."""
     back = jacobian.image(left, backward=True)
     with np.errstate(over="ignore"):
         image = (back.basis @ back.mixing) * np.exp(back.log_scale - log_s)
