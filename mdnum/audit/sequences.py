@@ -1,4 +1,4 @@
-"""Sequences of structures for one calculator object, to reveal errors in its neighbor list."""
+"""Sequences of structures that reveal errors in the neighbor list of a calculator."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ _INSIDE = (0.02, 0.1, 0.25)  # Å inside the cutoff at which they are asked abou
 
 
 class SequenceStep(NamedTuple):
-    """A structure of a sequence, its change from the previous structure, and whether results are checked."""
+    """A structure of a sequence, its change, and whether its results are checked."""
 
     what: str
     atoms: Atoms
@@ -29,7 +29,7 @@ class SequenceStep(NamedTuple):
 
 
 def all_sequences(atoms: Atoms, rng: np.random.Generator) -> dict[str, list[SequenceStep]]:
-    """Return, by name, all sequences of structures that can be made from a structure."""
+    """Return all sequences that can be made from a structure, by name."""
     sequences = {
         "sizes": _sizes(atoms, rng), "a slow drift": _slow_drift(atoms, rng),
         "two atoms head on": _head_on(atoms), "strain": _strain(atoms), "wrapping": _wrapping(atoms, rng),
@@ -39,7 +39,7 @@ def all_sequences(atoms: Atoms, rng: np.random.Generator) -> dict[str, list[Sequ
 
 
 def _sizes(atoms: Atoms, rng: np.random.Generator) -> Iterator[tuple[str, Atoms]]:
-    """Yield structures that differ in the number of atoms, in density, in species and in periodicity."""
+    """Yield structures with different numbers of atoms, densities, species and periodicity."""
     yield "the structure", atoms
     if len(atoms) <= 64 and atoms.pbc.any():
         yield "the structure grew to its supercell", atoms.repeat(np.where(atoms.pbc, 2, 1))
@@ -67,7 +67,7 @@ def _sizes(atoms: Atoms, rng: np.random.Generator) -> Iterator[tuple[str, Atoms]
 
 
 def _slow_drift(atoms: Atoms, rng: np.random.Generator) -> Iterator[tuple[str, Atoms]]:
-    """Yield structures whose atoms move in small steps, which add up to more than a neighbor-list skin."""
+    """Yield structures whose atoms move in small steps. The sum exceeds a neighbor-list skin."""
     heading = rng.standard_normal((len(atoms), 3))
     heading /= np.linalg.norm(heading, axis=1)[:, None]
     yield "the structure", atoms
@@ -78,7 +78,7 @@ def _slow_drift(atoms: Atoms, rng: np.random.Generator) -> Iterator[tuple[str, A
 
 
 def _head_on(atoms: Atoms) -> Iterator[tuple[str, Atoms]]:
-    """Yield structures in which one or two atoms approach another atom, to test the half-skin criterion."""
+    """Yield structures in which atoms approach another atom, to test the half-skin criterion."""
     if len(atoms) < 2:
         return
     distances = atoms.get_distances(0, range(1, len(atoms)), mic=bool(atoms.pbc.any()), vector=True)
@@ -112,7 +112,7 @@ def _strain(atoms: Atoms) -> Iterator[tuple[str, Atoms]]:
 
 
 def _wrapping(atoms: Atoms, rng: np.random.Generator) -> Iterator[tuple[str, Atoms]]:
-    """Yield structures with atoms that jump to other periodic images, as in programs that wrap positions."""
+    """Yield structures with atoms that jump to other periodic images."""
     if not atoms.pbc.any():
         return
     there = atoms
@@ -131,7 +131,7 @@ def _scaled(atoms: Atoms, factor: float) -> Atoms:
 
 
 def approaches(pair: Pair, radius: float) -> Iterator[tuple[str, list[SequenceStep]]]:
-    """Yield sequences in which two atoms come within the cutoff; each requires a new calculator object.
+    """Yield sequences in which two atoms come within the cutoff. Each needs a new calculator object.
 
     Args:
         radius: cutoff distance, beyond which the particles do not interact, Å.

@@ -1,7 +1,7 @@
-"""Locate the distance thresholds of a calculator's pair interactions, using only energies and forces.
+"""Find the distance thresholds of a calculator's pair interactions from energies and forces.
 
-Two atoms are moved from a large distance to the distance at which their energy is 1000 kT. Thresholds that
-appear only among many atoms (cutoffs of angles, limits on numbers of neighbors) are found by surroundings.py.
+Two atoms approach each other until their energy is 1000 kT. Thresholds among many atoms (of angles or numbers
+of neighbors) are found by surroundings.py.
 """
 
 from __future__ import annotations
@@ -55,7 +55,7 @@ _NOTHING = 1e-7  # of kT: where no more than this is left to be lost, the search
 
 @dataclass(frozen=True)
 class PairThreshold:
-    """A distance at which the energy or one of its derivatives jumps, or at which the interaction ends."""
+    """A distance at which the energy or a derivative jumps, or the interaction ends."""
 
     radius: float  # the distance, length
     species: tuple[str, str]  # of the two atoms (of the reference atoms of two molecules)
@@ -84,7 +84,7 @@ class Beyond:
 
 @dataclass(frozen=True)
 class PairWalk:
-    """Result of moving two particles toward each other, from a large distance to close contact."""
+    """Result of moving two particles toward each other."""
 
     pair: Pair
     thresholds: tuple[PairThreshold, ...]  # by distance
@@ -110,7 +110,7 @@ class PairWalk:
 
 @dataclass(frozen=True)
 class PairWalks:
-    """Results of moving two particles, for every pair of species, from a large distance to close contact."""
+    """Results of moving two particles toward each other, for every pair of species."""
 
     walks: tuple[PairWalk, ...]  # one for each pair that was walked
     ways: Ways  # all pairs that there are to walk, and what was left out
@@ -120,14 +120,14 @@ class PairWalks:
 
 
 def find_thresholds(subject: CalculatorSubject) -> list[PairThreshold]:
-    """Return all distance thresholds of the calculator's pair interactions; the scan is made only once."""
+    """Return all distance thresholds of a calculator. The scan is made only once."""
     if "thresholds" not in subject.known:  # a resumed audit knows them without a walk
         subject.known["thresholds"] = [one for walk in walk_pairs(subject).walks for one in walk.thresholds]
     return subject.known["thresholds"]
 
 
 def walk_pairs(subject: CalculatorSubject, progress: Progress = idle) -> PairWalks:
-    """Scan every pair of species over a range of distances; the scan is made only once."""
+    """Scan every pair of species over a range of distances, only once."""
     if "walks" not in subject.known:
         with subject.meter.apart(WALKING_CALLS):
             subject.known["walks"] = _walked(subject, progress)
@@ -165,7 +165,7 @@ def _walked(subject: CalculatorSubject, progress: Progress) -> PairWalks:
 
 
 def walk(subject: CalculatorSubject, pair: Pair, calls: float = np.inf) -> PairWalk:
-    """Scan the energy and force of one pair of particles over a range of distances.
+    """Scan the energy and force of one pair over a range of distances.
 
     Args:
         calls: number of calls after which only the most prominent point of the scan is examined.
@@ -247,10 +247,10 @@ def _seen(
     rounding: float,
     known: Sequence[float],
 ) -> tuple[float, float, float, float] | None:
-    """Return the range of examined distances, and median and maximum of the smallest detectable force jumps.
+    """Return the range of distances, and median and maximum of the smallest detectable force jumps.
 
-    Distances beyond the end of the interaction are omitted. Distances close to a known threshold are omitted
-    too, because a second threshold would be hidden there.
+    Distances beyond the end of the interaction are omitted. Distances close to a known threshold are also
+    omitted. A second threshold would be hidden there.
     """
     felt = places < end
     for radius in known:
@@ -264,7 +264,7 @@ def _seen(
 
 
 def _above(threshold: PairThreshold, quantum: tuple[float, float]) -> PairThreshold | None:
-    """Return a threshold if its jump exceeds rounding errors, or if the interaction ends at the threshold."""
+    """Return a threshold if its jump exceeds rounding errors, or the interaction ends there."""
     large = any(abs(jump) > STEPS * size for jump, size in zip(threshold.jumps[:2], quantum, strict=True))
     if threshold.order <= 1 and large:
         return threshold
@@ -272,7 +272,7 @@ def _above(threshold: PairThreshold, quantum: tuple[float, float]) -> PairThresh
 
 
 def _of_others(pair: Pair, threshold: PairThreshold, thresholds: Sequence[PairThreshold]) -> bool:
-    """Return whether other atoms of the two particles cross another threshold at the given pair distance."""
+    """Return whether other atoms of the particles cross another threshold at this distance."""
     others = pair.others(threshold.radius)
     radii = [one.radius for one in thresholds if one is not threshold]
     return len(others) > 0 and any(np.abs(others - radius).min() < 1e-5 for radius in radii)
@@ -284,10 +284,10 @@ def _of_others(pair: Pair, threshold: PairThreshold, thresholds: Sequence[PairTh
 def _end_of(
     coarse: Float[np.ndarray, "points"], alive: Callable[[float], bool]
 ) -> tuple[float, float] | None:
-    """Return the largest distance with an interaction, and the next larger double; None if there is none.
+    """Return the largest distance with an interaction, and the next double. None if there is none.
 
-    A smooth switching function may round to zero before its end. If the interaction is nonzero at a larger
-    distance, the search therefore continues from there.
+    A smooth switching function may round to zero before its end. The search continues if there is an
+    interaction at a larger distance.
     """
     last = next((k for k in range(len(coarse) - 2, -1, -1) if alive(float(coarse[k]))), None)
     if last is None:
@@ -340,10 +340,10 @@ def _with_end(
 
 
 def _root(curve: Curve, edge: float, room: float, power: int) -> float:
-    """Extrapolate a power law of the force to find the distance at which an interaction ends.
+    """Use a power law of the force to find where an interaction ends.
 
-    If the last distance with a nonzero force agrees with the extrapolation within its error, this distance is
-    returned instead. The last distance is more exact, unless rounding made the force zero.
+    If the last distance with a nonzero force agrees within the error, it is returned instead. The last
+    distance is more exact, unless rounding made the force zero.
     """
     places = edge - room * np.array([0.02, 0.01, 0.005])
     far, near, nearer = np.abs(curve.many(places)[1]) ** (1.0 / power)
@@ -363,10 +363,10 @@ def _root(curve: Curve, edge: float, room: float, power: int) -> float:
 def _beyond(
     subject: CalculatorSubject, pair: Pair, start: float, noise: Float[np.ndarray, "2"], calls: float
 ) -> Beyond | None:
-    """Search for a cutoff beyond the scanned distances, until the rest of the pair energy is negligible.
+    """Search for a cutoff beyond the scan, until the rest of the pair energy is negligible.
 
-    The result is None if no distance could be evaluated, because periodic images of the particles come too
-    close or because the calculator fails.
+    The result is None if no distance could be evaluated: periodic images are too close, or the calculator
+    fails.
     """
     if pair.periodic:
         return None
@@ -423,7 +423,7 @@ def _at(low: float, high: float) -> Float[np.ndarray, "nodes"]:
 def _rough(
     curve: Curve, low: float, high: float, noise: Float[np.ndarray, "2"]
 ) -> Iterator[tuple[float, float]]:
-    """Yield narrow intervals where the force is not smooth or does not agree with the energy change."""
+    """Yield narrow intervals in which the force is not smooth or contradicts the energy."""
     if high <= low or _smooth(curve, low, high, noise):
         return
     if high - low < _NARROW:
@@ -446,7 +446,7 @@ def _smooth(curve: Curve, low: float, high: float, noise: Float[np.ndarray, "2"]
 
 
 def _left(nodes: Float[np.ndarray, "nodes"], forces: Float[np.ndarray, "nodes"]) -> float:
-    """Return the energy change from the last point to infinity for a power-law force; inf if it diverges."""
+    """Return the energy change to infinity for a power-law force. inf if it diverges."""
     first, last = abs(float(forces[0])), abs(float(forces[-1]))
     if not last or not first:
         return np.inf
@@ -455,7 +455,7 @@ def _left(nodes: Float[np.ndarray, "nodes"], forces: Float[np.ndarray, "nodes"])
 
 
 def _expected(curve: Curve, place: float) -> float:
-    """Extrapolate the force to a distance by a power law fitted at slightly smaller distances."""
+    """Extrapolate the force by a power law fitted at smaller distances."""
     near, far = place - 0.5, place - 0.25
     first, last = (abs(curve(one)[1]) for one in (near, far))
     if not first or not last:

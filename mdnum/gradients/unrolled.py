@@ -1,13 +1,13 @@
-"""Let JAX differentiate all operations of the steps in reverse mode, like `jax.grad` of the whole run.
+"""Differentiation of all operations of the steps in reverse mode, like `jax.grad` of the run.
 
-A chunk is a scan over a fixed number of steps with one neighbor list. Chunks of steps limit the memory that
-reverse mode needs. If the neighbor list must be rebuilt, the remaining steps of the chunk are skipped. The
-host then builds the list at the present positions. The states between chunks are stored. If memory is
-insufficient, every second state is dropped, and the steps between the remaining states are run again.
+A chunk is a scan over steps with one neighbor list. Chunks of steps limit the memory that reverse mode needs.
+A chunk ends early if the neighbor list must be rebuilt. The host then builds the list at the present
+positions. The states between chunks are stored. If memory is insufficient, every second state is dropped. The
+steps after it are then run again.
 
-The differentiated program may round differently from an ordinary run, and then make other decisions. If
-decisions differ, the gradient belongs to another trajectory. Therefore, the states and decisions of all steps
-are compared with those of an ordinary run.
+The differentiated program may round differently and then make other decisions. If decisions differ, the
+gradient belongs to another trajectory. All states and decisions are therefore compared with those of an
+ordinary run.
 """
 
 from __future__ import annotations
@@ -45,7 +45,7 @@ _CHUNK_BYTES, _PER_SLOT = 2**28, 256
 
 
 class Inputs(NamedTuple):
-    """All inputs of a simulation with respect to which a loss can be differentiated."""
+    """All inputs with respect to which a loss can be differentiated."""
 
     model: Any  # the quantities of the force
     numbers: Any  # those of the integrator
@@ -68,7 +68,7 @@ class StepEnds(NamedTuple):
 
 
 class RunConstants(NamedTuple):
-    """Constants of a run that are not differentiated; force parameters are taken from `Inputs`."""
+    """Constants of a run that are not differentiated. Force parameters are in `Inputs`."""
 
     force: Any
     integrator: Any
@@ -83,7 +83,7 @@ class RunConstants(NamedTuple):
 
 
 class Place(NamedTuple):
-    """Nondifferentiable state, needed to continue a run: integers, and data of the neighbor list."""
+    """State that is not differentiated but needed to continue: integers and the neighbor list."""
 
     step: Int[Array, ""]  # the step whose forces come next
     images: Int[Array, "3 atoms"]  # lattice vectors taken off so far
@@ -94,7 +94,7 @@ class Place(NamedTuple):
 
 
 class ChunkRecord(NamedTuple):
-    """Results of a chunk of steps other than its final state: status, states and decisions of each step."""
+    """Status, states and decisions of each step in a chunk."""
 
     place: Place  # where it ended
     rows: Int[Array, ""]  # steps done
@@ -116,7 +116,7 @@ def chunk(
     tables: Tables,
     rule: tuple[int, int, bool],
 ) -> tuple[StepEnds, ChunkRecord]:
-    """Run a chunk of steps with one neighbor list, differentiable with respect to the first two arguments.
+    """Run a chunk of steps with one neighbor list. The first two arguments are differentiable.
 
     Args:
         limit: largest number of steps. seen: which of the chunk's steps the loss uses.
@@ -196,19 +196,19 @@ def chunk(
 
 @partial(jax.jit, static_argnames=("rule",))
 def keep(inputs, between, *rest, rule):
-    """Return the final state of a chunk of steps, its vector-Jacobian product (`jax.vjp`), and its record."""
+    """Return the final state of a chunk, its vector-Jacobian product (`jax.vjp`), and its record."""
     return jax.vjp(lambda *given: chunk(*given, *rest, rule), inputs, between, has_aux=True)
 
 
 @jax.jit
 def pull(back, onto_between: StepEnds, onto_inputs: Inputs) -> tuple[StepEnds, Inputs]:
-    """Propagate cotangents backward through a chunk of steps, and sum the cotangents of the inputs."""
+    """Propagate cotangents backward through a chunk. Sum the cotangents of the inputs."""
     by_inputs, by_between = back(onto_between)
     return by_between, jax.tree.map(jnp.add, onto_inputs, by_inputs)
 
 
 class Snapshot(NamedTuple):
-    """State between two chunks of steps; `slots` is the capacity of the neighbor list (0 for default)."""
+    """State between two chunks. `slots` is the capacity of the neighbor list (0 for default)."""
 
     between: StepEnds
     place: Place
@@ -216,7 +216,7 @@ class Snapshot(NamedTuple):
 
 
 class ChunkedProgram:
-    """A simulation with a loss, run in chunks of steps; JAX can differentiate each chunk."""
+    """A simulation with a loss, run in chunks that JAX can differentiate."""
 
     def __init__(self, problem: Problem):
         simulation = problem.simulation
@@ -277,7 +277,7 @@ class ChunkedProgram:
         return self._used[1]
 
     def cotangents(self, start: StepEnds, inputs: Inputs) -> Cotangents:
-        """Convert cotangents of `Inputs` and initial state to derivatives with respect to all inputs."""
+        """Convert cotangents of `Inputs` and initial state to derivatives."""
         numbers, x, v = onto_start(self.simulation, self.start.between, start.extra)
         inputs = inputs._replace(numbers=jax.tree.map(jnp.add, inputs.numbers, numbers))
         start = start._replace(x=start.x + x, v=start.v + v)
@@ -374,7 +374,7 @@ def marks(first: int, rows: range, x, v, bits, table: PairTable) -> Iterator[tup
 
 
 def departure(run: Mapping[int, Any], other: Mapping[int, Any]) -> dict[str, int | None]:
-    """Return the first step at which two programs' states differ, and the first at which decisions differ."""
+    """Return the first step at which states differ, and the first at which decisions differ."""
     both = sorted(run.keys() & other.keys())
     different = [[step for step in both if run[step][k] != other[step][k]] for k in (0, 1)]
     state, decision = (steps[0] if steps else None for steps in different)

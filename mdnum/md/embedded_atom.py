@@ -34,8 +34,7 @@ class Setfl:
 def read_setfl(path: Path, symbols: Sequence[str] = ()) -> Setfl:
     """Read a setfl table with all digits; line breaks between numbers are ignored.
 
-    The reader of jax-md rounds all numbers to float32, which causes errors of 4e-4 eV/Å in the forces of
-    copper.
+    The reader of jax-md rounds numbers to float32. Forces in copper then have errors of 4e-4 eV/Å.
 
     Args:
         symbols: chemical symbols of the atoms, which must agree with the element of the table.
@@ -107,7 +106,7 @@ class Spline(eqx.Module):
     """Piecewise cubic interpolation of a table, twice continuously differentiable ("not-a-knot" ends).
 
     The spline equals scipy's InterpolatedUnivariateSpline(k=3), which ASE's EAM uses. Outside the table, the
-    spline is extrapolated with the first and last cubic; see `inside`.
+    first and last cubic continue; see `inside`.
     """
 
     # of 1, t, t², t³ per interval, t the distance from its left end, shape (4, intervals)
@@ -119,7 +118,7 @@ class Spline(eqx.Module):
 
     @classmethod
     def through(cls, values: Float[np.ndarray, "points"], step: float, start: float = 0.0) -> Spline:
-        """Make the spline through the values at start, start + step, start + 2 step, ..."""
+        """Return the spline through values at start, start + step, ..."""
         from scipy.interpolate import CubicSpline
 
         # fitted on the whole numbers: knots like i * step are rounded, and their differences more so
@@ -143,7 +142,7 @@ class Spline(eqx.Module):
     def on_host(
         self, x: Float[np.ndarray, "..."]
     ) -> tuple[Float[np.ndarray, "..."], Float[np.ndarray, "..."]]:
-        """Return value and slope of the spline at x with numpy; the value equals jax's bit for bit."""
+        """Return value and slope at x by numpy. The value equals jax's bit for bit."""
         offset = x - self.start
         which = np.clip(np.floor(offset / self.step), 0, self.intervals - 1)
         t = offset - which * self.step
@@ -151,7 +150,7 @@ class Spline(eqx.Module):
         return c0 + t * (c1 + t * (c2 + t * c3)), c1 + t * (c2 + t * c3) + t * (c2 + t * c3 + t * c3)
 
     def inside(self, x: Float[Array, "..."]) -> Array:
-        """Return True if x is in the range of the table, within rounding error."""
+        """Return True if x is inside the table, within rounding error."""
         slack = 1e-9 * self.step
         return (x >= self.start - slack) & (x <= self.end + slack)
 
@@ -162,14 +161,14 @@ class Spline(eqx.Module):
 class EmbeddedAtom(ManyBody):
     """E = sum_i F(rho_i) + 1/2 sum_ij phi(r_ij), rho_i = sum_j density(r_ij), for one element.
 
-    The EAM energy of jax-md is correct only for a neighbor list in which no atom is its own neighbor. The
-    neighbor lists of jax-md contain each atom as its own neighbor, which adds the density at r = 0. The
-    splines of jax-md round the table to float32 and return 0 outside its range.
+    The EAM energy of jax-md requires a neighbor list in which no atom is its own neighbor. The neighbor lists
+    of jax-md contain each atom itself. This adds the density at r = 0. The splines of jax-md use float32.
+    Outside the table they are 0.
 
-    Error: energy and forces are NaN if the electron density of an atom is outside the embedding table. The
-    deviation of the spline from the tabulated function is not considered an error.
+    Error: energy and forces are NaN if an electron density is outside the embedding table. The error of the
+    spline itself is not included.
 
-    The implementation was checked against ase.calculators.eam and a plain evaluation in extended precision
+    Checked against ase.calculators.eam and a plain evaluation in extended precision
     (tests/support/oracles_manybody.py). Source: Daw and Baskes, Phys. Rev. B 29, 6443 (1984).
     """
 
@@ -182,17 +181,17 @@ class EmbeddedAtom(ManyBody):
     file: str = eqx.field(static=True, kw_only=True, default="")  # the table that it was read from
 
     def charge(self, r: Float[Array, "..."]) -> Float[Array, "..."]:
-        """Return the electron density due to an atom at distance r; 0 at r = 0 and beyond r_cut."""
+        """Return the electron density at distance r from an atom. 0 at r = 0 and beyond r_cut."""
         counts = (r > 0) & (r < self.r_cut)
         return jnp.where(counts, self.density(jnp.where(counts, r, 1.0)), 0.0)
 
     def phi(self, r: Float[Array, "..."]) -> Float[Array, "..."]:
-        """Return the pair energy at distance r; 0 at r = 0 and beyond r_cut."""
+        """Return the pair energy at distance r. 0 at r = 0 and beyond r_cut."""
         counts = (r > 0) & (r < self.r_cut)
         return jnp.where(counts, self.pair(jnp.where(counts, r, 1.0)), 0.0)
 
     def embed(self, rho: Float[Array, "..."]) -> Float[Array, "..."]:
-        """Return the embedding energy of an atom at a given density; NaN outside the table."""
+        """Return the embedding energy at a given density. NaN outside the table."""
         # a factor and not a selection: it makes the slope NaN too, and forces with it
         on = self.embedding.inside(rho)
         return self.embedding(rho * jnp.where(on, 1.0, jnp.nan).astype(rho.dtype))
@@ -235,7 +234,7 @@ def embedded_atom(
 
 
 def _smoothness(table: Setfl, pair: Spline, density: Spline, embedding: Spline) -> Smoothness:
-    """Return upper limits of the jumps at r_cut, where a crossing changes one pair term and two densities."""
+    """Return upper limits of the jumps at r_cut. A crossing changes one pair term and two densities."""
     steepest = np.max(np.abs(embedding.on_host(table.drho * np.arange(len(table.embedding)))[1]))
     at = np.array([table.r_cut])
     energy, force = (

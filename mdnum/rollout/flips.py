@@ -1,4 +1,4 @@
-"""Table of flips (pairs that cross the cutoff): atoms, step, distance from the cutoff and energy jump."""
+"""Table of flips: atoms, step, distance from the cutoff and energy jump."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ def _mixed(key):
 
 @njit
 def fingerprint_of_bits(bits, index, order):
-    """Count and hash the pairs inside the cutoff; the results do not depend on the order of the list."""
+    """Count and hash the pairs inside the cutoff. The order of the list has no effect."""
     count, total = 0, np.uint64(0)
     atoms, listed = order.shape[0], index.shape[0] // 8
     for w in range(bits.shape[0]):
@@ -62,7 +62,7 @@ def _fingerprint_of_keys(keys):
 
 @njit
 def _note_rows(before, rows, index, x, v, pairs, ends, count):
-    """Record the changes of cutoff decisions in consecutive time steps with the same neighbor list."""
+    """Record the changes of cutoff decisions between time steps with the same neighbor list."""
     held = before.copy()
     for r in range(len(rows)):
         note(held, rows[r], index, x[r], v[r], r, pairs, ends, count)
@@ -71,7 +71,7 @@ def _note_rows(before, rows, index, x, v, pairs, ends, count):
 # atoms in one place have no radial speed: not a number, as in numpy
 @njit(error_model="numpy")
 def _columns(pairs, ends, labels, species, kinds, by_type, bounds, rule, boxes, narrow, back, first, factor):
-    """Compute the columns of the table of flips; check that distances agree with recorded decisions.
+    """Compute the columns of the table of flips. Check the distances against the decisions.
 
     Args:
         labels: labels of the sorted atoms. species: species by label. kinds: pair type of two species.
@@ -139,7 +139,7 @@ def _columns(pairs, ends, labels, species, kinds, by_type, bounds, rule, boxes, 
 
 
 def _back(segment: Segment) -> Float[np.ndarray, "rows 3 3"]:
-    """Return the deformation from each step's box to the previous step's box; empty for a fixed box."""
+    """Return the deformation from each step's box to the previous box. Empty for a fixed box."""
     if not segment.cells:
         return np.empty((0, 3, 3))
     before = jax.tree.map(np.asarray, segment.start.cells[1]), *segment.cells[:-1]
@@ -147,7 +147,7 @@ def _back(segment: Segment) -> Float[np.ndarray, "rows 3 3"]:
 
 
 def _noted(before, bits, index, x, v) -> Changes:
-    """Return the changes of cutoff decisions in consecutive steps with the same neighbor list."""
+    """Return the changes of cutoff decisions between steps with the same neighbor list."""
     room = len(bits) * max(64, bits.shape[2] // 4)
     while True:
         made = np.empty((room, 4), np.int32), np.empty((room, 12), x.dtype), np.zeros(3, np.int64)
@@ -159,7 +159,7 @@ def _noted(before, bits, index, x, v) -> Changes:
 
 @dataclass(frozen=True)
 class AmbiguousPairs(Columns):
-    """Pairs whose cutoff decision could have been reversed by rounding errors, one row per pair and step."""
+    """Pairs whose cutoff decision rounding errors could reverse. Each row is a pair at a step."""
 
     step: Int[np.ndarray, "rows"]  # of the decision
     # i, j: the pair, i < j
@@ -173,9 +173,9 @@ class AmbiguousPairs(Columns):
 class PairRecorder:
     """Recorder of all flips (pairs that cross the cutoff) in a simulation.
 
-    A flip is a difference between the decisions for a pair at two consecutive steps, even if the neighbor
-    list was rebuilt in between. If the old list lacks a pair inside the cutoff, the pair's flip is recorded
-    with the new list. A pair that is not in the new neighbor list counts as outside the cutoff.
+    A flip is a change of a pair's decision between two consecutive steps. The neighbor list may be rebuilt in
+    between. A pair that the old list lacks is recorded with the new list. A pair outside the new neighbor
+    list counts as outside the cutoff.
 
     Args:
         simulation: the system as objects.
@@ -198,11 +198,11 @@ class PairRecorder:
         self._by_type = np.stack([thresholds, *simulation.jumps()])
 
     def inside(self, bits: UInt8[np.ndarray, "words atoms"]) -> int:
-        """Return the number of pairs inside the cutoff; pairs that a list contains twice are counted once."""
+        """Return the number of pairs inside the cutoff. A pair listed twice counts once."""
         return self._once(int(count_set(bits)))
 
     def _once(self, both: int) -> int:
-        """Return half of a count in which each pair occurs twice; raise an error if the count is odd."""
+        """Return half of a count in which each pair occurs twice. Raise an error if it is odd."""
         if both % 2:
             raise MdnumError(
                 "a pair is inside the cutoff for only one of its two atoms", remedy="Report this as a bug"
@@ -210,18 +210,18 @@ class PairRecorder:
         return both // 2
 
     def counts(self, segment: Segment) -> Int[np.ndarray, "rows"]:
-        """Return the number of pairs inside the cutoff at every step of a segment."""
+        """Return the number of pairs inside the cutoff at every step."""
         if segment.changes is None:
             return np.array([self.inside(bits) for bits in segment.rows_of("bits")], np.int64)
         return np.array([self._once(int(both)) for both in segment.rows_of("inside")], np.int64)
 
     def _stacked(self, cells: Sequence[Cell]) -> tuple[Any, Any]:
-        """Return boxes in float64 and, if cutoff decisions have another dtype, also in this dtype."""
+        """Return boxes in float64 and, if it differs, in the dtype of cutoff decisions."""
         dtype = self.simulation.decider.dtype
         return stacked(cells), None if dtype == "float64" else stacked(cells, dtype)
 
     def bounds(self, segment: Segment) -> Float[np.ndarray, "rows types"]:
-        """Bounds on the rounding error of the compared quantity (r or r²) at each step."""
+        """Bounds on the rounding error of r or r² at each step."""
         decider = self.simulation.decider
         if not decider.grows and not segment.cells:
             return np.repeat([decider.bounds], segment.rows, axis=0)
@@ -232,11 +232,11 @@ class PairRecorder:
         return np.concatenate([one.bounds_at(x[[row]]) for row, one in enumerate(each)])
 
     def ambiguous(self, segment: Segment) -> Int[np.ndarray, "rows"]:
-        """Number of pairs with a decision that rounding errors could reverse, at each step of a segment."""
+        """Number of pairs at each step whose decision rounding errors could reverse."""
         return np.bincount(self.doubtful(segment).step - segment.first, minlength=segment.rows)
 
     def doubtful(self, segment: Segment) -> AmbiguousPairs:
-        """Return the pairs with a decision that rounding errors could reverse, sorted by step."""
+        """Return the pairs whose decision rounding errors could reverse, sorted by step."""
         parts = [AmbiguousPairs.none()]
         bounds, table, dtype = self.bounds(segment), segment.table, np.dtype(self.simulation.decider.dtype)
         # almost always no pair comes that close; where one does, the host looks again
@@ -258,10 +258,10 @@ class PairRecorder:
         return AmbiguousPairs.concatenate(parts)
 
     def flips(self, segment: Segment) -> FlipTable:
-        """Return a segment's flips sorted by step, i and j, with the user's atom labels (see `type_of`).
+        """Return a segment's flips sorted by step, i and j. Atom labels are the user's (see `type_of`).
 
         Distance, margin and radial speed refer to the step of the flip. The margin (threshold minus r or r²)
-        equals the margin computed in the run, bit for bit.
+        equals that of the run, bit for bit.
 
         Raises:
             MdnumError: a flip was recorded for only one atom of a pair, or a margin contradicts its decision
@@ -331,21 +331,21 @@ class PairRecorder:
         return (margin >= 0 if inclusive else margin > 0) != ledger.entered
 
     def held(self) -> Int[np.ndarray, "pairs"] | None:
-        """Return integer keys of pairs inside the cutoff at the last step of the previous neighbor list."""
+        """Return keys of the pairs inside the cutoff at the last step of the previous list."""
         if self._held_segment is not None:
             table, bits, _ = self._held_segment
             self._held_keys = _keys(self.simulation, table, np.asarray(bits))
         return self._held_keys
 
     def _cannot_differ(self, segment: Segment) -> bool:
-        """Return True if the old and the new neighbor list must have the same pairs inside the cutoff."""
+        """Return True if both neighbor lists must have the same pairs inside the cutoff."""
         rule = self.simulation.rule
         if self._held_segment is None or not rule.safe:
             return False
         return 2 * float(segment.leap) < rule.skin and self._held_segment[2] == int(segment.inside)
 
     def _replace(self, segment: Segment) -> tuple[np.ndarray, np.ndarray] | None:
-        """Return the pairs that are inside the cutoff in only one of two successive neighbor lists."""
+        """Return the pairs that are inside the cutoff in only one of two neighbor lists."""
         self.missed = 0
         if not segment.opens or (self._held_segment is None and self._held_keys is None):
             return None
@@ -371,7 +371,7 @@ class PairRecorder:
 def pair_keys(
     i: Int[np.ndarray, "pairs"], j: Int[np.ndarray, "pairs"], atoms: int
 ) -> Int[np.ndarray, "pairs"]:
-    """Return sorted integer keys, one for each pair i < j; for the argument i, see `Simulation.type_of`."""
+    """Return sorted integer keys of pairs i < j. `Simulation.type_of` explains the argument i."""
     return np.sort(i.astype(np.int64) * atoms + j)
 
 
@@ -383,7 +383,7 @@ def _keys(simulation: Simulation, table: PairTable, bits: UInt8[np.ndarray, "wor
 
 @njit
 def _write_keys(bits, index, order, place, keys):
-    """Write integer keys of all pairs inside the cutoff, in ascending order; return the number of keys."""
+    """Write the keys of all pairs inside the cutoff in ascending order. Return their number."""
     atoms, listed, at = order.shape[0], index.shape[0] // 8, 0
     # the channel of a decision counts as one of its first atom
     for first in range(atoms * (bits.shape[0] // listed)):
@@ -404,7 +404,7 @@ def _write_keys(bits, index, order, place, keys):
 
 
 def decided_pairs(simulation: Simulation, segment: Segment, row: int) -> Int[np.ndarray, "pairs"]:
-    """Return integer keys of the pairs that were inside the cutoff at one step of a run."""
+    """Return integer keys of the pairs inside the cutoff at one step of a run."""
     return _keys(simulation, segment.table, bits_of(segment, row))
 
 
@@ -416,7 +416,7 @@ def bits_of(segment: Segment, row: int) -> UInt8[np.ndarray, "words atoms"]:
 
 
 def true_pairs(simulation: Simulation, wrapped: Float[np.ndarray, "atoms 3"]) -> Int[np.ndarray, "pairs"]:
-    """Find all pairs inside the cutoff by a new search with the run's arithmetic; return their keys."""
+    """Return keys of all pairs inside the cutoff, from a new search with the run's arithmetic."""
     decider = simulation.decider
     table = simulation.verlet_list(skin=0.0).build(np.asarray(wrapped, np.float64), simulation.cell)
     _, _, i, j = table.listed(simulation.channels)

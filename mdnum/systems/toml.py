@@ -1,9 +1,8 @@
-"""Reading and writing of system files (TOML), with line numbers in errors and with overrides of keys.
+"""Reading and writing of system files (TOML), with line numbers in errors.
 
-The standard library reads TOML, but does not write TOML and does not record the line of a key. For system
-files, this module writes TOML and finds the line of a key. If the keys of a table depend on its `kind` or
-`rule`, the table is a union of pydantic models; `models` selects one. Each error message is one line with the
-value found, the expected value and the line of the file.
+The standard library only reads TOML, without line numbers. This module also writes TOML and finds the line of
+a key. If the keys depend on `kind` or `rule`, a table is a union of pydantic models; `models` selects one. An
+error message has the value, the expected value and the line of the file.
 """
 
 from __future__ import annotations
@@ -69,9 +68,9 @@ def parse(text: str, where: str | Path) -> dict[str, Any]:
 
 
 def scalar(text: str) -> Any:
-    """Parse a command-line value as TOML; text that is not valid TOML is used as a string.
+    """Parse a command-line value as TOML. Invalid TOML is a string.
 
-    As values, `switched` and `"switched"` are equal; `0.5` is a number, `true` a Boolean, `[2, 2]` an array.
+    `switched` and `"switched"` are equal. `0.5` is a number, `true` a Boolean, `[2, 2]` an array.
     """
     try:
         parsed = tomllib.loads(f"value = {text}")
@@ -81,7 +80,7 @@ def scalar(text: str) -> Any:
 
 
 def _is_deep(value: Any) -> bool:
-    """Return True if tables and arrays are nested too deeply for a system file."""
+    """Return True if tables and arrays are nested too deeply."""
     level = [value]
     for _ in range(_DEEPEST):
         level = [
@@ -124,7 +123,7 @@ def _dotted_prefix(text: str) -> tuple[Key, int]:
 
 
 def line_of(text: str, key: Key) -> int | None:
-    """Return the number of the line that sets a key or starts its table; None if there is no such line."""
+    """Return the line number that sets a key or starts its table. None if there is none."""
     best: tuple[int, int] | None = None
     table: Key = ()
     for number, line in enumerate(text.splitlines(), start=1):
@@ -144,9 +143,9 @@ def line_of(text: str, key: Key) -> int | None:
 
 
 def dump(tables: Mapping[str, Any]) -> str:
-    """Return the TOML text of nested tables; values of None are omitted, and floats keep every bit.
+    """Return the TOML text of nested tables. None is omitted, and floats keep every bit.
 
-    In each table, `kind` or `rule` is written first, then other scalars, then tables (required by TOML).
+    Each table starts with `kind` or `rule`. Scalars come before tables.
     """
     lines: list[str] = []
     _dump_table((), tables, lines)
@@ -205,7 +204,7 @@ def loaded(registry: str) -> Any:
 
 
 class Named:
-    """Type annotation for a key of a system file whose value must be a name from a registry.
+    """Type annotation for a key whose value must be a name in a registry.
 
     Args:
         registry: "module:attribute"; imported for the first validation, because the module may be slow to
@@ -265,17 +264,17 @@ class TomlTable(BaseModel):
 
     @staticmethod
     def foreign_keys(table: Mapping[str, Any]) -> set[str]:
-        """Return the keys of a table that do not apply to the kind given in this table."""
+        """Return the keys of a table that do not apply to its kind."""
         return set()
 
 
 def unusable(key: str, message: str, remedy: str) -> PydanticCustomError:
-    """Create the validation error for an invalid value, with the dotted key of this value."""
+    """Create the validation error for a value, with its dotted key."""
     return PydanticCustomError("unusable", "{said}", {"said": message, "remedy": remedy, "key": key})
 
 
 def models(root: type[TomlTable], key: Key, data: Mapping[str, Any]) -> list[type[TomlTable]]:
-    """Return the pydantic models that fit the table at a key, best first; none if the key has no table."""
+    """Return the pydantic models for the table at a key, best first. Empty if there is no table."""
     found, table = [root], data
     for part in key:
         table = table.get(part, {}) if isinstance(table, Mapping) else {}
@@ -296,7 +295,7 @@ def _models_in(annotation: Any) -> Iterator[type[TomlTable]]:
 
 
 def _chosen(options: Sequence[type[TomlTable]], table: Any) -> type[TomlTable] | None:
-    """Return the pydantic model in a union that matches the contents of a table."""
+    """Return the pydantic model in a union that fits a table."""
     tag = _tag_of(options)
     given = table.get(tag) if tag and isinstance(table, Mapping) else None
     if tag and isinstance(given, str):
@@ -310,7 +309,7 @@ def _chosen(options: Sequence[type[TomlTable]], table: Any) -> type[TomlTable] |
 
 
 def _tag_of(options: Sequence[type[TomlTable]]) -> str | None:
-    """Return the key ("kind" or "rule") that distinguishes the models of a union, or None."""
+    """Return the key ("kind" or "rule") that distinguishes the models, or None."""
     keys = {name for model in options for name in model.model_fields}
     return next((name for name in ("kind", "rule") if name in keys), None)
 
@@ -352,7 +351,7 @@ _BOUNDS = {
 
 @dataclass(frozen=True)
 class Source:
-    """The text and location of a system file, and the overrides of its keys."""
+    """Text and location of a system file, with the overrides of its keys."""
 
     name: str  # what the system was called by
     path: Path  # the file
@@ -361,7 +360,7 @@ class Source:
     values: Mapping[Key, Any] = field(default_factory=dict)  # overrides, by key
 
     def place(self, key: Key) -> str:
-        """Return the file and line that set a key, or the command-line override that set the key."""
+        """Return the file and line, or the override, that set a key."""
         if any(key[: len(given)] == given for given in self.values):
             return f"--set {'.'.join(key)}"
         number = line_of(self.text, key) if key else None
@@ -376,7 +375,7 @@ Root = TypeVar("Root", bound=TomlTable)
 
 
 def checked(root: type[Root], data: Mapping[str, Any], source: Source) -> Root:
-    """Validate the tables of a system file and return the model of the whole file.
+    """Validate the tables of a system file and return its model.
 
     Raises:
         InputError: the tables are not valid; the message describes the most informative error in one line.
@@ -494,7 +493,7 @@ _RIVALS: dict[Key, tuple[str, ...]] = {
 
 
 def read_overrides(overrides: Mapping[str, Any] | None) -> dict[Key, Any]:
-    """Parse overrides, given as values by dotted key; text is parsed as a TOML value.
+    """Parse overrides by dotted key. Text is parsed as TOML.
 
     Raises:
         InputError: a key is not a valid dotted key.
@@ -504,7 +503,7 @@ def read_overrides(overrides: Mapping[str, Any] | None) -> dict[Key, Any]:
 
 
 def apply_overrides(data: dict[str, Any], values: Mapping[Key, Any], root: type[TomlTable]) -> None:
-    """Set overrides in the tables; if a kind is overridden, remove keys that do not apply to the new kind.
+    """Set overrides in the tables. Remove keys that do not apply to an overridden kind.
 
     Raises:
         InputError: an enclosing key has a value that is not a table.

@@ -1,10 +1,10 @@
-"""Interpretation of the six box numbers in a DCD file, which may follow one of three conventions.
+"""Interpretation of the six box numbers in a DCD file. There are three conventions.
 
-DCD files do not record the convention of the box. The six numbers are lengths and cosines of the angles
-(NAMD, VMD, LAMMPS, MDAnalysis since 2.10), lengths and angles in degrees (CHARMM before version 22, OpenMM,
-MDAnalysis before 2.10), or a symmetric matrix of lattice vectors (CHARMM since 22). With a wrong box, atoms
-overlap across the boundary, and atoms that are wrapped between frames seem to leap. If several conventions
-fit the positions, the version number in the header decides. All programs except CHARMM write version 24.
+DCD files do not record the convention of the box. The six numbers may be lengths and cosines of the angles
+(NAMD, VMD, LAMMPS, MDAnalysis since 2.10). They may be lengths and angles in degrees (CHARMM before version
+22, OpenMM, MDAnalysis before 2.10). They may be a symmetric matrix of lattice vectors (CHARMM since 22). With
+a wrong box, atoms overlap across the boundary, and wrapped atoms seem to leap. If several conventions fit the
+positions, the version number in the header decides. All programs except CHARMM write version 24.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ Examined = list[tuple[int, np.ndarray, np.ndarray]]
 
 
 def conventions(cell: Float[np.ndarray, "6"]) -> dict[str, Float[np.ndarray, "3 3"]]:
-    """Return the lattice vectors by each convention that gives a valid box, MDAnalysis's convention first."""
+    """Return the lattice vectors by each convention that gives a valid box. MDAnalysis's is first."""
     from MDAnalysis.lib.mdamath import triclinic_vectors
 
     angles, found = cell[[4, 3, 1]], {}
@@ -48,7 +48,7 @@ def conventions(cell: Float[np.ndarray, "6"]) -> dict[str, Float[np.ndarray, "3 
 
 
 class DcdBoxes:
-    """Lattice vectors of a DCD file, in the box convention that is consistent with the positions.
+    """Lattice vectors of a DCD file. The box convention is the one that fits the positions.
 
     Attributes:
         convention: name of the chosen convention; None if no examined box depends on the choice.
@@ -77,7 +77,7 @@ class DcdBoxes:
             self.notes = (f"The box in the file is read as {self.convention}, {why}.",)
 
     def _sample(self, path: str) -> Iterator[tuple[int, np.ndarray, np.ndarray]]:
-        """Yield (frame number, positions, six box numbers) of sampled frames whose box is not rectangular."""
+        """Yield (frame number, positions, six box numbers) of sampled frames without a rectangular box."""
         count = len(self._file)
         for number in sorted({*range(min(count, 8)), *np.linspace(0, count - 1, 4).astype(int).tolist()}):
             try:
@@ -91,7 +91,7 @@ class DcdBoxes:
                 yield number, x, cell
 
     def __call__(self, number: int, ts: Any) -> Float[np.ndarray, "3 3"] | None:
-        """Return the lattice vectors of a frame; None if MDAnalysis's are correct or were set by the user."""
+        """Return the lattice vectors of a frame. None if MDAnalysis's are correct or set by the user."""
         vectors = self._vectors(number, self.convention) if self.convention == _MATRIX else None
         if vectors is None:
             return None
@@ -99,7 +99,7 @@ class DcdBoxes:
         return vectors if any(np.allclose(one, ts.dimensions[:3], rtol=1e-5) for one in lengths) else None
 
     def instead(self, number: int) -> Float[np.ndarray, "3 3"] | None:
-        """Return the lattice vectors of a frame by the second convention that fits, or None."""
+        """Return the lattice vectors by the second convention that fits, or None."""
         return self._vectors(number, self.other)
 
     def _vectors(self, number: int, convention: str | None) -> Float[np.ndarray, "3 3"] | None:
@@ -108,7 +108,7 @@ class DcdBoxes:
 
 
 def _plausible(frames: Examined, fit: list[str]) -> list[str]:
-    """Return the conventions that are consistent with both the box numbers and the atomic positions."""
+    """Return the conventions that fit the box numbers and the positions."""
     gone: dict[str, list[float]] = {name: [] for name in fit}
     for (before, start, _), (number, end, cell) in pairwise(frames):
         moved = end - start - np.median(end - start, axis=0)
@@ -131,7 +131,7 @@ def _plausible(frames: Examined, fit: list[str]) -> list[str]:
 
 
 def _contacts(number: int, x: np.ndarray, cell: np.ndarray, name: str) -> Float[np.ndarray, "pairs"]:
-    """Return the distances, in length units, of all pairs closer than the mean spacing of the atoms."""
+    """Return the distances of all pairs closer than the mean spacing of the atoms."""
     boxes = conventions(cell)
     volume = max(abs(float(np.linalg.det(one))) for one in boxes.values())
     tracker = Tracker(CutoffRule(float(np.cbrt(volume / len(x)))))

@@ -1,6 +1,6 @@
-"""Flips and contacts of pairs in a trajectory, and counts of the flips found if every nth frame is read.
+"""Flips and contacts of pairs in a trajectory. Flips are also counted for every nth frame.
 
-From the flips found with every nth frame, the module `lost` estimates the flips missed between frames.
+From these counts, the module `lost` estimates the flips missed between frames.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ _ROOM = 2**62
 
 
 class Sums:
-    """Counts for a subset of the atom pairs, which can be added to the counts for another subset."""
+    """Counts for a subset of the atom pairs. Counts of two subsets can be added."""
 
     # what is the same for all pairs
     _common: tuple[str, ...] = ()
@@ -36,7 +36,7 @@ class Sums:
 
 @dataclass(frozen=True)
 class History:
-    """Flips, in frame order, of each pair that was inside the cutoff at the first frame or flipped later."""
+    """Flips of each pair that was ever inside the cutoff, in frame order."""
 
     i: Int[np.ndarray, "pairs"]  # the pairs, sorted, each once; see `ledger.Members`
     j: Int[np.ndarray, "pairs"]
@@ -95,7 +95,7 @@ class History:
 
 
 def _grouped(columns: Sequence[np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
-    """Return the indices that sort rows by all columns, and a mask of the first of each set of equal rows."""
+    """Return the indices that sort rows by all columns, and a mask of the first of equal rows."""
     if not len(columns[0]):
         return np.zeros(0, np.int64), np.zeros(0, bool)
     sizes = [int(column.max()) + 1 for column in columns]
@@ -113,10 +113,10 @@ def _grouped(columns: Sequence[np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
 
 @dataclass(frozen=True)
 class Contacts(Columns):
-    """Contacts (periods in which a pair is inside the cutoff), sorted by (i, j, image rank, first frame).
+    """Periods in which a pair is inside the cutoff, sorted by (i, j, image rank, first frame).
 
-    During a contact, the pair is inside the cutoff at the frames `begin`, ..., `end - 1`. A contact begins
-    between the frames `begin - 1` and `begin`. A break of contact between two frames is not detected.
+    The pair is inside the cutoff at the frames `begin`, ..., `end - 1`. A contact begins between the frames
+    `begin - 1` and `begin`. A break of contact between two frames is not detected.
     """
 
     i: Int[np.ndarray, "stays"]  # the pair; see `ledger.Members`
@@ -157,7 +157,7 @@ def contacts(history: History) -> Contacts:
 
 
 def mended(stays: Contacts, gap: int) -> Contacts:
-    """Merge contacts of a pair that are separated by at most `gap` frames (intermittent contacts)."""
+    """Merge contacts of a pair that are at most `gap` frames apart (intermittent contacts)."""
     if gap < 1 or not len(stays):
         return stays
     same = np.all([column[1:] == column[:-1] for column in (stays.i, stays.j, stays.rank)], axis=0)
@@ -184,7 +184,7 @@ class Strides(Sums):
 
     @classmethod
     def of_history(cls, history: History, strides: Sequence[int]) -> Strides:
-        """Count flips at each stride; an odd number of flips of a pair in one stride counts as one flip."""
+        """Count flips at each stride. An odd number of flips in one stride counts as one flip."""
         found = []
         for stride in strides:
             rows = np.flatnonzero(history.frame <= (history.frames - 1) // stride * stride)
@@ -198,12 +198,12 @@ class Strides(Sums):
 
     @property
     def share(self) -> Float[np.ndarray, "strides"]:
-        """Fraction of the flips that are found at each stride; nan if there are no flips."""
+        """Fraction of the flips that each stride finds. nan if there are no flips."""
         return np.divide(self.flips, self.of, out=np.full(len(self.of), np.nan), where=self.of > 0)
 
 
 def doublings(frames: int) -> list[int]:
-    """Return strides (in frames) 1, 2, 4, ..., each of which fits at least four times into the trajectory."""
+    """Return the strides 1, 2, 4, ... (frames) that fit at least four times into the trajectory."""
     strides = [1]
     while (frames - 1) // (2 * strides[-1]) >= 4:
         strides.append(2 * strides[-1])
@@ -211,11 +211,10 @@ def doublings(frames: int) -> list[int]:
 
 
 def crossings(frame: Frame, count: Callable[[Frame, Frame], int], move: float) -> tuple[int, float] | None:
-    """Count the pair decisions that change if all atoms move in straight lines for a short time.
+    """Count the flips of pairs if all atoms move in straight lines for a short time.
 
-    The root mean square displacement of the atoms is `move`. Choose `move` shorter than the distance over
-    which paths bend, but long enough for many pairs to cross the cutoff. `count` returns the number of flips
-    between two frames.
+    The root mean square displacement of the atoms is `move`. Choose a short `move`, for straight paths, but
+    long enough that many pairs cross the cutoff. `count` returns the number of flips between two frames.
 
     Returns:
         (number of flips, duration of the motion in the time unit of the velocities); None if no atom moves.

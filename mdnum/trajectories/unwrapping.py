@@ -1,9 +1,9 @@
 """Unwrapping of atomic paths across box boundaries, and detection of discontinuities between frames.
 
-In each frame, wrapping must move atoms by integer combinations of the frame's lattice vectors. Otherwise,
-quantities computed from the path of the atom are wrong (von Bülow, Bullerjahn and Hummer, J. Chem. Phys. 153,
-021101, 2020). This module removes a jump by adding lattice vectors of the same frame, which preserves
-displacements (Bullerjahn, von Bülow, Heidari, Hénin and Hummer, J. Chem. Theory Comput. 19, 3406, 2023).
+In each frame, wrapping must move atoms by lattice vectors of this frame. Otherwise, the unwrapped path
+is wrong (von Bülow, Bullerjahn and Hummer, J. Chem. Phys. 153, 021101, 2020). A jump is removed by lattice
+vectors of the same frame, which preserves displacements (Bullerjahn, von Bülow, Heidari, Hénin and Hummer, J.
+Chem. Theory Comput. 19, 3406, 2023).
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ _GROUPS = 8
 
 @dataclass
 class Unwrapping:
-    """Unwrapped paths of up to `_PAIRS` pairs of atoms adjacent in the file, in fully periodic boxes."""
+    """Unwrapped paths of up to `_PAIRS` pairs of adjacent atoms in fully periodic boxes."""
 
     atoms: AtomIndices
     _first: np.ndarray | None = None
@@ -42,7 +42,7 @@ class Unwrapping:
     _lengths: list[np.ndarray] = field(default_factory=list)  # distances in pairs at the first frames
 
     def see(self, frame: Frame) -> dict[str, Any] | None:
-        """Return the row of the table of atomic motion for a frame; None unless the box is fully periodic."""
+        """Return the row of a frame in the table of motion. None unless the box is fully periodic."""
         x, cell = frame.positions if self.atoms is None else frame.positions[self.atoms], frame.box.matrix
         if not frame.box.pbc.all() or len(x) < 2:
             return None
@@ -68,7 +68,7 @@ class Unwrapping:
         }  # fmt: skip
 
     def _pairs(self, here: np.ndarray, there: np.ndarray, cell: np.ndarray) -> dict[str, Any]:
-        """Return relative changes of nearly constant distances: pairs across a box boundary, other pairs."""
+        """Return relative changes of nearly constant distances, for pairs across a boundary and others."""
         images = np.rint(there - here)
         split = images.any(axis=1) | (np.floor(here) != np.floor(there)).any(axis=1)
         lengths = np.linalg.norm((there - here - images) @ cell, axis=1)
@@ -84,7 +84,7 @@ class Unwrapping:
 
 
 def told(rows: Mapping[str, np.ndarray], atoms: int, timed: bool) -> dict[str, Any] | None:
-    """Summarize the table of atomic motion as plain values; None if there are fewer than three frames."""
+    """Summarize the table of motion as plain values. None for fewer than three frames."""
     if len(rows["frame"]) < 3:
         return None
     # before the first frame nothing moved
@@ -109,7 +109,7 @@ def told(rows: Mapping[str, np.ndarray], atoms: int, timed: bool) -> dict[str, A
 
 
 def _seams(number: np.ndarray, step: np.ndarray, jumps: np.ndarray, atoms: int) -> list[dict[str, Any]]:
-    """Return frames in which all atoms move suddenly, or more atoms jump than in adjacent frames."""
+    """Return frames with a sudden motion of all atoms, or with unusually many jumps."""
     found = []
     for k in range(len(step)):
         around = np.r_[max(k - _AROUND, 0) : k, k + 1 : min(k + _AROUND, len(step) - 1) + 1]

@@ -1,4 +1,4 @@
-"""Run two simulations that differ in one numerical choice, and write the results to an output folder."""
+"""Run two simulations that differ in one numerical choice, and write an output folder."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ _MD_ALONE = ("energy_back", "nearest_a", "nearest_b", "ambiguous_a", "ambiguous_
 
 @dataclass(frozen=True)
 class PairQuestion:
-    """Options for a pair of runs; names and meanings are those of the arguments of `fork`."""
+    """Options for a pair of runs, as in `fork`."""
 
     steps: int | None = None
     split: float | None = None
@@ -94,7 +94,7 @@ def of_md(
 
 
 def basics(system: Simulation | System | BallSystem, steps: int | None) -> dict[str, Any]:
-    """Return summary.json's entries on a system: name, number of atoms or balls, last step, time step."""
+    """Return summary entries on a system: name, number of atoms or balls, last step, time step."""
     from mdnum.systems import BallSystem, System
 
     head: dict[str, Any] = {"system": system.name}
@@ -159,7 +159,7 @@ def followed(
 
 
 def _numbers(made: Fork) -> dict[str, Any]:
-    """Return summary entries on two runs: steps of divergence, verdict, and growth of their distance."""
+    """Return summary entries on two runs: steps of divergence, verdict, and growth of distance."""
     step, verdict, growth = made.twin.a.timestep, made.verdict, made.growth["B"]
     dates = {"first_bit": made.dates.first_bit, "fork": made.dates.fork, "split": made.dates.split}
     free, imposed, overridden = (
@@ -204,7 +204,7 @@ def _numbers(made: Fork) -> dict[str, Any]:
 
 
 def _boxes(made: Fork, dates: Mapping[str, int | None]) -> dict[str, Any]:
-    """Return the strain between the boxes of runs A and B: its maximum, and values at end and divergence."""
+    """Return the strain between the boxes of two runs: maximum, at the end and at divergence."""
     if "strain" not in made.series:
         return {}
     strain, free = made.series["strain"], made.series["B"]
@@ -217,7 +217,7 @@ def _boxes(made: Fork, dates: Mapping[str, int | None]) -> dict[str, Any]:
 
 
 def _fit(fit: Any, separation: np.ndarray) -> dict[str, Any]:
-    """Return the fit exp(intercept + rate * step) to the distance between two runs, and the fitted steps."""
+    """Return the fit exp(intercept + rate * step) to a distance, and the fitted steps."""
     if not np.isfinite(fit.rate):
         return dict.fromkeys(("rate", "r_squared", "first", "last", "intercept"))
     step = np.arange(fit.first, fit.last + 1)
@@ -226,7 +226,7 @@ def _fit(fit: Any, separation: np.ndarray) -> dict[str, Any]:
 
 
 def _predicted(made: Fork, summary: Mapping[str, Any]) -> dict[str, Any]:
-    """Predict the step at which two runs split, from the distance between them or the Lyapunov exponent."""
+    """Use the distance or the Lyapunov exponent to predict the step at which two runs split."""
     from mdnum.numerics.verdicts import expected
 
     exponent = summary.get("lyapunov")
@@ -251,7 +251,7 @@ def _separation(made: Fork) -> dict[str, Any]:
 
 
 def _decision(made: Fork) -> dict[str, Any] | None:
-    """Return the first decision that differs between runs A and B, as plain values."""
+    """Return the first decision that differs between two runs, as plain values."""
     decision = made.decision
     if decision is None:
         return None
@@ -335,7 +335,7 @@ def _of_md(made: Fork, asked: PairQuestion, answer: Answer) -> dict[str, Any]:
 
 
 def _of_ball(made: Fork, tables: dict[str, Any]) -> dict[str, Any]:
-    """Return summary entries, and add tables of decisions and heights, for a pair of ball runs."""
+    """Return summary entries for two ball runs. Add tables of decisions and heights."""
     names = ("step", "channel", "ball", "a", "b", "margin_a", "margin_b", "bound_a", "bound_b", "run")
     flips = [{name: getattr(flip, name) for name in names} for flip in made.flips]
     tables["cross_flips"] = [
@@ -357,7 +357,7 @@ def _of_ball(made: Fork, tables: dict[str, Any]) -> dict[str, Any]:
 
 
 def _exponent(made: Fork) -> dict[str, Any]:
-    """Return the largest Lyapunov exponent of run A, or the reason why the exponent is unknown."""
+    """Return the largest Lyapunov exponent of run A, or why it is unknown."""
     from mdnum.forks.linearized import lyapunov
 
     def why(name: str, **values: Any) -> dict[str, Any]:
@@ -391,7 +391,7 @@ def _exponent(made: Fork) -> dict[str, Any]:
 
 
 def _pinned(made: Fork, pin: str, separation: dict[str, Any]) -> dict[str, Any]:
-    """Repeat run B with decisions of run A imposed; return the result, or the reason why it is impossible."""
+    """Repeat run B with decisions of run A. Return the result, or why it is impossible."""
     from mdnum.forks.replays import parse_pin, pinned
 
     try:
@@ -408,7 +408,7 @@ def _pinned(made: Fork, pin: str, separation: dict[str, Any]) -> dict[str, Any]:
 
 
 def _minimal(made: Fork, log: Progress) -> dict[str, Any]:
-    """Return a smallest set of imposed decisions that keeps run B close to run A, if one is found."""
+    """Return a smallest set of imposed decisions that keeps run B close to run A, if any."""
     from mdnum.forks.replays import disagreements, minimal_cause
 
     try:

@@ -1,4 +1,4 @@
-"""Check the work around small closed loops, which is zero if the forces are the gradient of an energy."""
+"""Check the work around small closed loops. It is zero for the gradient of an energy."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ Displacement = Float[np.ndarray, "atoms 3"]
 
 @dataclass(frozen=True)
 class Loop:
-    """Work done by the forces around a circle in the space of all atomic coordinates."""
+    """Work of the forces around a circle in the space of all coordinates."""
 
     plane: str  # in words
     radius: float  # Å, of the displacement of all atoms together
@@ -36,12 +36,12 @@ class Loop:
 
     @property
     def conservative(self) -> bool:
-        """True if the curl of the forces is zero within the error of the curl."""
+        """True if the curl of the forces is zero within its error."""
         return abs(self.curl) <= _SIGNIFICANT * self.error
 
     @property
     def share(self) -> float:
-        """Ratio of the antisymmetric to the symmetric part of the derivative matrix of the forces."""
+        """Ratio of the antisymmetric to the symmetric part of the forces' derivative matrix."""
         return abs(self.curl) / self.stiffness if self.stiffness else (float("inf") if self.curl else 0.0)
 
 
@@ -52,7 +52,7 @@ class CurlCheck(AuditCheck):
     needed_to = ("differentiate",)
 
     def ask(self, subject: CalculatorSubject, progress: Progress) -> CheckResult:
-        """Compute the work of the forces around circles in several planes of coordinate space."""
+        """Compute the work of the forces around circles in several planes."""
         rng = np.random.default_rng(self.seed)
         worker = subject.fresh()
         radii, ways = _RADII[:1] if self.brief else _RADII, Ways()
@@ -98,10 +98,9 @@ class CurlCheck(AuditCheck):
 
 
 def agreed(tried: Sequence[Loop]) -> Loop:
-    """Return the loop whose curl has the smallest error; enlarge this error if loops of other radii disagree.
+    """Return the loop with the smallest error. Its error is enlarged if other radii disagree.
 
-    The curl is the same for every small circle, while the work due to a jump of the forces depends on the
-    radius.
+    The curl is the same for every small circle. The work at a jump of the forces depends on the radius.
     """
     best = min(tried, key=lambda one: one.error)
     others = [one.curl for one in tried if _SIGNIFICANT * one.error < abs(best.curl)]
@@ -112,7 +111,7 @@ def agreed(tried: Sequence[Loop]) -> Loop:
 def _planes(
     subject: CalculatorSubject, atoms: Atoms, rng: np.random.Generator
 ) -> Iterator[tuple[str, Displacement, Displacement]]:
-    """Yield planes spanned by two orthonormal displacement vectors of all atoms, of one atom or of a pair."""
+    """Yield planes of two orthonormal displacements of all atoms, of one atom or of a pair."""
     count = len(atoms)
     if count > 1:
         for number in range(3):
@@ -151,9 +150,9 @@ def around(
     noise: NoiseFloor,
     plane: str = "",
 ) -> Loop:
-    """Compute the work of the forces on the circle x + radius (u cos t + v sin t), with orthonormal u and v.
+    """Compute the work on the circle x + radius (u cos t + v sin t). u and v are orthonormal.
 
-    Error: the error is estimated from the force noise, and from the work with half or a third of the points.
+    Error: from the force noise, and from the work with half or a third of the points.
     """
     angles = 2 * np.pi * np.arange(_POINTS) / _POINTS
     forces = [

@@ -1,13 +1,13 @@
-"""Contribution of each flip to a gradient, and the parameter values at which pair decisions change.
+"""Contribution of each flip to a gradient, and parameter values at which decisions change.
 
-The contribution of a flip to a gradient is a product of two factors. The first factor, from a reverse pass,
-is the derivative of the loss with respect to the cutoff distance at this flip alone. This derivative includes
-the effect of later flips. The second factor, from tangents without flips, is the derivative of the cutoff
-distance minus that of the pair distance. The contributions of single flips add up to that of all flips.
+The contribution of a flip to a gradient is a product of two factors. The first factor is the derivative of
+the loss with respect to the cutoff distance at this flip alone. This derivative includes the effect of later
+flips. The second factor is the derivative of the cutoff distance minus that of the pair distance, without
+flips. The contributions of single flips add up to that of all flips.
 
-A decision boundary is a parameter value, between two adjacent floats, at which a pair decision changes.
-Between two boundaries all runs make the same decisions, and loss and gradient are smooth functions of the
-parameter. Gradients on both sides of a boundary show whether an optimizer step across it is useful.
+A decision boundary lies between two adjacent floats of a parameter. A pair decision changes there. Between
+two boundaries, decisions are constant. Loss and gradient are smooth. Gradients on both sides show whether an
+optimizer step across a boundary is useful.
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ _FIRST, _FACTOR = 1e-12, 8.0
 
 @dataclass(frozen=True)
 class FlipTerms:
-    """Contributions of all flips to the derivative with respect to each parameter entry, largest first.
+    """Contributions of all flips to each derivative, largest first.
 
     Columns are named by scalar parameters and single array entries, such as "potential.sigma[1]".
     """
@@ -68,7 +68,7 @@ def flips(
     made: ReversePass | None = None,
     progress: Progress | None = None,
 ) -> FlipTerms:
-    """Compute the contribution of each flip to a gradient, and sort flips by contribution.
+    """Compute the contribution of each flip to a gradient. Sort flips by contribution.
 
     Args:
         problem: of a pair potential. names: parameters, full or short names.
@@ -134,7 +134,7 @@ def flips(
 
 @dataclass(frozen=True)
 class DecisionEdge:
-    """Nearest parameter value in one direction at which a decision changes, and gradients on both sides."""
+    """Nearest parameter value at which a decision changes, with gradients on both sides."""
 
     side: str  # "below" or "above"
     runs: int  # that the search took
@@ -170,10 +170,10 @@ class DecisionEdges:
 def edges(
     problem: Problem, name: str, *, reach: float = REACH, progress: Progress | None = None
 ) -> DecisionEdges:
-    """Find the nearest decision boundaries below and above a parameter's value, with gradients on both sides.
+    """Find the nearest decision boundaries of a parameter, below and above its value.
 
-    Tangents predict the parameter shift at which a decision first changes. Near the predicted shift, runs are
-    compared until two adjacent floats with different decisions are found.
+    Tangents predict the parameter shift at which a decision first changes. Runs near this shift are compared
+    until two adjacent floats have different decisions.
 
     Args:
         problem: of a pair potential. name: a parameter of one entry.
@@ -211,7 +211,7 @@ def edges(
 
 
 def _forecast(problem: Problem, name: str, progress: Progress | None) -> dict[int, float]:
-    """Use tangents to predict the smallest parameter shifts, up and down, at which a pair crosses r_cut."""
+    """Predict the smallest parameter shifts, up and down, at which a pair crosses r_cut."""
     if name == "box.scale":
         # the images move too, which these differences of positions leave out
         return {-1: np.inf, 1: np.inf}
@@ -285,7 +285,7 @@ def _edge(
 
 
 def _gradients(problem: Problem, simulation: Simulation, name: str) -> tuple[float, dict[str, float]]:
-    """Return the loss, and its derivative with respect to one parameter by two gradient methods."""
+    """Return the loss and its derivative by two gradient methods."""
     there = Problem(simulation, problem.loss, problem.steps)
     tape = tape_of(there, True)
     found = {
