@@ -273,8 +273,8 @@ def constant_division() -> DoctorRow:
 def subnormals() -> DoctorRow:
     """Test whether numpy and jax keep numbers below 2.2e-308, or set them to zero.
 
-    XLA sets subnormal numbers to zero on CPUs. A loaded library can make the processor do this in
-    all operations. Arrays that XLA splits among its own threads are tested, too. Results are compared as
+    XLA sets subnormal numbers to zero on CPUs. A loaded library can make the processor do this in all
+    operations. Arrays that XLA splits among its own threads are tested, too. Results are compared as
     integers, since a comparison of floats may treat subnormal numbers as zero.
     """
 

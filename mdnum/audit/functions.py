@@ -1,7 +1,7 @@
-"""Check numerically how smooth a user's pair function is between close contact and the cutoff.
+"""Check numerically how smooth a user's pair function is inside the cutoff.
 
-A run records the flips at the cutoff. If a pair function itself is discontinuous, for example where two
-pieces do not join, the run records no flip there. Derivatives of the run do not include this discontinuity.
+A run records the flips at the cutoff. A run records no flip at a discontinuity of the pair function itself,
+for example between two pieces. Derivatives of the run do not include this discontinuity.
 """
 
 from __future__ import annotations
@@ -42,7 +42,7 @@ _ORDERS = ("energy", "force", "curvature", "third derivative")
 
 
 def examined(simulation: Simulation) -> dict[str, Any] | None:
-    """Find discontinuities of a user's pair functions, from the smallest initial distance to the cutoff.
+    """Find discontinuities of a user's pair functions inside the cutoff.
 
     Returns:
         None if all potentials belong to mdnum, else plain values: `from` and `to`, length; `smoothness`, the

@@ -319,9 +319,9 @@ class Penalty(eqx.Module):
 class Projection(_Forceless):
     """Iterate y ← y + alpha k max(0, -y) until the stopping rule holds; then clamp y and apply restitution.
 
-    Each iteration multiplies the penetration by 1 - alpha k. Hence p0 falls to tol
-    after ceil(log(tol / p0) / log(1 - alpha k)) iterations. Iterations overshoot for alpha k between 1
-    and 2. They never end for alpha k = 2. The floor is at 0 for any k. The value of k affects only the remaining penetration.
+    Each iteration multiplies the penetration by 1 - alpha k. Hence p0 falls to tol after ceil(log(tol / p0) /
+    log(1 - alpha k)) iterations. Iterations overshoot for alpha k between 1 and 2. They never end for alpha k
+    = 2. The floor is at 0 for any k. The value of k affects only the remaining penetration.
     """
 
     k: Any  # gain, dimensionless; what is learned in place of a stiffness

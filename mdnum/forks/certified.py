@@ -1,13 +1,13 @@
-"""Certify the decisions of one run, and the agreement of its decisions with those of another run.
+"""Certify the decisions of a run, and their agreement with those of another run.
 
-Up to the *certified horizon* of a run, every decision margin exceeded its rounding bound. Exact arithmetic
-would give the same decisions for the same states. Up to the end of *protection*, every pair distance differed
-from its cutoff by more than it can differ between the two runs. Up to the certified horizon and the end of
-protection, the decisions of the two runs agree. If one of two programs is at least as precise as the other in
-every role, their decisions agree up to the *shadow horizon*.
+Up to the *certified horizon*, every decision margin of a run exceeded its rounding bound. Exact arithmetic
+would give the same decisions for the same states. Up to the end of *protection*, |distance - cutoff| of every
+pair exceeded the possible difference of the distance between the runs. Up to both steps, the decisions of the
+two runs agree. Up to the *shadow horizon*, decisions agree if one program is at least as precise as the other
+in every role.
 
-Decisions are certified only for the actual states of the run. A run whose decisions are correct for its
-states may have left the exact trajectory at an earlier step (`forks.exact.certify` finds the step).
+Decisions are certified only for the actual states of the run. A run with correct decisions may have left the
+exact trajectory earlier (`forks.exact.certify` finds the step).
 """
 
 from __future__ import annotations
@@ -44,7 +44,7 @@ _ROOT_BITS = 400
 
 @dataclass(frozen=True)
 class Horizon:
-    """Last step before the first ambiguous decision of a run, and the number of its ambiguous decisions."""
+    """Last step before a run's first ambiguous decision, and the number of such decisions."""
 
     # the last one before the first ambiguous decision; the last one followed where there is none, -1 where
     # the start is ambiguous
@@ -70,7 +70,7 @@ class Certified:
 
 
 def certified(fork: Fork) -> Certified:
-    """Compute the certified horizons, the end of protection and the shadow horizon of a pair of runs."""
+    """Compute the certified horizons, the end of protection and the shadow horizon."""
     twin, last = fork.twin, fork.steps
     if twin.a.imposable or twin.b.imposable:
         return Certified({}, None, None, None)
@@ -92,9 +92,9 @@ def _horizon(run: Simulation, ambiguous: Float[np.ndarray, "steps"]) -> Horizon:
 
 
 def protection(fork: Fork) -> tuple[Float[np.ndarray, "steps"], Float[np.ndarray, "steps"]]:
-    """For each step, return the smallest |pair distance - cutoff|, and the bound above which decisions agree.
+    """Return the smallest |pair distance - cutoff| of each step, and the bound above which decisions agree.
 
-    If positions of atoms differ between the two runs by at most d, a pair distance differs by at most 2 d.
+    If atoms differ by at most d between the runs, a pair distance differs by at most 2 d.
     Pair distances are taken from the run with the smaller rounding error. The rounding error of the distances
     is added to the bound.
     """
@@ -107,15 +107,15 @@ def protection(fork: Fork) -> tuple[Float[np.ndarray, "steps"], Float[np.ndarray
 
 
 def _cutoffs(decider: PairDecider) -> Float[np.ndarray, "types"]:
-    """Return the thresholds of the decisions as distances, in the dtype of the program."""
+    """Return the decision thresholds as distances, in the dtype of the program."""
     values = np.array([threshold.value for threshold in decider.thresholds])
     return np.sqrt(values) if decider.space == "r2" else values
 
 
 def wider(twin: Twin) -> str | None:
-    """Return the program that is more precise in at least one role and in no role less precise, or None.
+    """Return the program that is more precise in some role and less precise in none, or None.
 
-    The programs may differ only in precision; another time step, for example, has effects beyond rounding.
+    The programs may differ only in precision. Another time step has effects beyond rounding.
     """
     a, b = twin.a.simulation, twin.b.simulation
     if twin.a.begin is not None or twin.b.begin is not None or _but_for_roles(a) != _but_for_roles(b):
@@ -157,7 +157,7 @@ class AmbiguousDecision:
 
 @dataclass(frozen=True)
 class CertifiedHorizon:
-    """The steps at which all decisions of one run are certain for the states of this run."""
+    """The steps at which all decisions of a run are certain for its own states."""
 
     # first step with an ambiguous decision; every decision before it would have come out the same in exact
     # arithmetic from the same states. None where there is none
@@ -169,7 +169,7 @@ class CertifiedHorizon:
 
 
 def certified_horizon(simulation: Simulation, steps: int) -> CertifiedHorizon:
-    """Compare every margin of a run with its rounding bound; repeat ambiguous decisions in exact arithmetic.
+    """Compare every margin of a run with its rounding bound. Repeat ambiguous decisions in exact arithmetic.
 
     Raises:
         InputError: the rule for rebuilding neighbor lists may miss pairs.
@@ -204,11 +204,11 @@ def exact_margin(
     end: Float[np.ndarray, "3"],
     kind: int = 0,
 ) -> tuple[Fraction, bool]:
-    """Compute the margin of a pair without rounding errors, and the decision that results from the margin.
+    """Compute the margin of a pair without rounding errors, and its decision.
 
     The positions are the floating-point numbers of the state, taken as exact. The threshold and the lattice
-    vectors have double precision, as in the exact program, even if the run uses another dtype for decisions.
-    The margin, expressed as a distance, is accurate to 400 binary digits; the decision is exact.
+    vectors are in double precision, even if the run uses another dtype. The margin, as a distance, is
+    accurate to 400 bits. The decision is exact.
 
     Args:
         start, end: positions of the two atoms, length.

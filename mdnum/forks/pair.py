@@ -1,4 +1,4 @@
-"""Compare two runs: find the steps at which decisions first differ and at which the runs split."""
+"""Compare two runs: find when decisions first differ and when the runs split."""
 
 from __future__ import annotations
 
@@ -173,7 +173,7 @@ def fork(
 def counterfactuals(
     twin: Twin, counterfactual: bool, back: bool | None, repeats: int | None
 ) -> tuple[bool, bool, int]:
-    """Return whether run B gets run A's decisions, whether A gets B's, and how often run B is repeated.
+    """Return whether run B gets run A's decisions, whether A gets B's, and the number of repeats.
 
     Raises:
         InputError: a requested counterfactual run or repeat is not possible.
@@ -191,7 +191,7 @@ def counterfactuals(
 
 
 def repeats_asked(repeats: int | None, counterfactual: bool, why: str = "such runs are disabled") -> int:
-    """Return the number of repeats of run B: the requested number, or a default if none is requested.
+    """Return the number of repeats of run B.
 
     Raises:
         InputError: the number is negative or too small for a significant result, or no repeats can be run.
@@ -212,16 +212,16 @@ def repeats_asked(repeats: int | None, counterfactual: bool, why: str = "such ru
 
 
 def _beyond(step: int) -> int:
-    """Return the step to which a run must be continued to conclude that the runs do not split."""
+    """Return the step up to which two runs must stay together to count as not split."""
     return int(np.ceil(PATIENCE * step)) + 1
 
 
 def displacements(fork: Fork) -> tuple[float, float]:
     """Return two initial displacements for repeats of run B: an early distance from run A, and a smaller one.
 
-    The second displacement is a hundredth of the first. A repeat with a much smaller displacement would make
-    the same rounding errors as the compared runs, and so would prove nothing. If a hundredth of the first
-    displacement is below one ulp, the second may be larger than the first.
+    The second displacement is a hundredth of the first. A much smaller displacement would lead to the same
+    rounding errors as in the compared runs. The second may be larger if a hundredth of the first is below one
+    ulp.
     """
     begins = (fork.dates.fork if fork.dates.first_bit is None else fork.dates.first_bit) or 0
     soon = fork.series["B"][begins : min(max(begins, 1) + _SOON, fork.dates.fork or fork.steps + 1)]
@@ -232,7 +232,7 @@ def displacements(fork: Fork) -> tuple[float, float]:
 
 
 def _repeated(found: Fork, most: int, progress: Progress | None) -> Fork:
-    """Repeat run B as often as the verdict requires, and add the results to the comparison of the runs."""
+    """Repeat run B as often as the verdict requires. Add the results to the comparison."""
     a, b, series, tolerance = found.twin.a, found.twin.b, dict(found.series), found.tolerance
     while wanted := found.verdict.wanted:
         place, sizes = int(found.verdict.other is not None), displacements(found)
@@ -327,7 +327,7 @@ def _series(gathered: list[PairRows]) -> dict[str, np.ndarray]:
 
 @result
 class Screened:
-    """Effect of one numerical choice on a run, up to the last compared step."""
+    """Effect of one numerical choice on a run."""
 
     choice: str  # its name
     difference: str  # one line; why it does not apply where it does not
@@ -342,7 +342,7 @@ class Screened:
 
     @property
     def held(self) -> bool | None:
-        """True if both runs were identical to the last bit; None if the run with this choice was not made."""
+        """True if both runs were identical to the last bit. None if there was no second run."""
         return None if self.reason_unavailable is not None else self.first_bit is None
 
 
@@ -354,7 +354,7 @@ def screen(
     on: str | Executor | None = None,
     workers: int | None = None,
 ) -> list[Screened]:
-    """Compare two runs for each numerical choice, without counterfactual runs; list the earliest fork first.
+    """Compare two runs for each numerical choice. List the earliest fork first.
 
     Args:
         system: a system that was loaded from a file.

@@ -1,7 +1,6 @@
-"""Build the programs of systems (molecular dynamics or bouncing balls); read and change system parameters.
+"""Build the programs of systems, and read and change system parameters.
 
-Modules of molecular dynamics are imported inside functions, because they import jax_md, which is not required
-for a ball.
+Modules of molecular dynamics are imported inside functions. They need jax_md, but a ball does not.
 """
 
 from __future__ import annotations
@@ -46,9 +45,9 @@ def program_of(system: Simulation | BallSystem, steps: int | None = None) -> Pro
 
 
 def packed(system: Simulation | BallSystem, *more: Any) -> bytes:
-    """Pickle a system and other objects for another process, where `unpacked` restores them bit for bit.
+    """Pickle a system and other objects for another process (see `unpacked`).
 
-    The other process loads a system from its file, because code in the file exists only in this process.
+    The other process loads a system from its file, because code in the file exists only here.
     """
     import cloudpickle
 
@@ -60,7 +59,7 @@ def packed(system: Simulation | BallSystem, *more: Any) -> bytes:
 
 @lru_cache(1)
 def unpacked(data: bytes) -> tuple[Any, ...]:
-    """Restore objects pickled by `packed`; keep the last system, so that its programs are compiled once."""
+    """Restore objects pickled by `packed`. The last system is kept to compile its programs once."""
     import cloudpickle
 
     own, *more = cloudpickle.loads(data)
@@ -68,7 +67,7 @@ def unpacked(data: bytes) -> tuple[Any, ...]:
 
 
 def varied(system: Any, values: Mapping[str, Any], name: str | None = None) -> Any:
-    """Return a copy of a system with other values of some keys, validated like the keys of a system file.
+    """Return a copy of a system with other values of some keys. The values are validated.
 
     Args:
         system: a simulation, or the system of a ball.
@@ -90,15 +89,15 @@ def varied(system: Any, values: Mapping[str, Any], name: str | None = None) -> A
 
 
 def twin(system: Any, values: Mapping[str, Any], name: str, difference: str) -> Twin:
-    """Make a pair of programs: one of a system, and one of the same system with other values of some keys."""
+    """Make a pair of programs: one of a system, one of the same system with other values."""
     other = varied(system, values, name)
     a, b = map(program_of, alike(system, other))
     return Twin(a, b, difference, changes(system, other))
 
 
 def alike(a: Any, b: Any) -> tuple[Any, Any]:
-    """Return two systems whose decisions can be compared. If terms of the potential share pair decisions in
-    only one system, both returned systems decide separately for each term.
+    """Return two systems whose decisions can be compared. If terms share pair decisions in only one system,
+    both systems decide separately for each term.
     """
     if isinstance(a, BallSystem) or not (a.pairwise and b.pairwise):
         return a, b
@@ -109,7 +108,7 @@ def alike(a: Any, b: Any) -> tuple[Any, Any]:
 
 
 def changes(a: Any, b: Any) -> dict[str, list[Any]]:
-    """Return the keys with values that differ between two systems, and both values of each key."""
+    """Return the keys whose values differ between two systems, with both values."""
     if isinstance(a, BallSystem):
         tables = tuple(one.spec.model_dump(mode="json", exclude={"variants"}) for one in (a, b))
     else:
@@ -125,7 +124,7 @@ def changes(a: Any, b: Any) -> dict[str, list[Any]]:
 
 
 def floats(system: Any) -> dict[str, float]:
-    """Return, by dotted key, the floating-point parameters of a system that enter into a time step."""
+    """Return the floating-point parameters of a time step, by dotted key."""
     if isinstance(system, BallSystem):
         data = system.spec.model_dump(mode="python", exclude_none=True, exclude=set(_BALL_ELSEWHERE))
         return {key: value for key, value in flat(data).items() if isinstance(value, float)}
@@ -135,7 +134,7 @@ def floats(system: Any) -> dict[str, float]:
 
 
 def as_used(system: Any, key: str) -> tuple[float, Any]:
-    """Return a parameter of the system file as stored in the program, and the dtype in which it is used."""
+    """Return a parameter as stored in the program, and the dtype in which it is used."""
     value = floats(system)[key]
     if not isinstance(system, BallSystem):
         return value, "float64"

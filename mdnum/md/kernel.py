@@ -1,10 +1,10 @@
-"""Sums over the neighbors of every atom, computed by one compiled loop that XLA calls on a CPU.
+"""Sums over the neighbors of every atom. XLA calls one compiled loop on a CPU.
 
-jax traces a function of one pair. The operations of this function are written as LLVM text for vectors of
-eight atoms. The data of each atom are contiguous, so that loading a neighbor takes one or two instructions.
-The terms of eight neighbor slots are summed in registers. XLA's own loop gathers neighbor data and computes
-terms in separate passes. No operation is contracted or reordered, so that equal input gives equal output on
-every processor. XLA calls the loop through its foreign-function interface (xla/ffi/api/c_api.h, version 0.3).
+jax traces a function of one pair. The operations are written as LLVM text for vectors of eight atoms. The
+data of each atom are contiguous. Loading a neighbor thus takes one or two instructions. The terms of eight
+neighbor slots are summed in registers. XLA's own loop gathers neighbor data and computes terms in separate
+passes. No operation is contracted or reordered. Equal input thus gives equal output on every processor.
+XLA calls the loop through its foreign-function interface (xla/ffi/api/c_api.h, version 0.3).
 """
 
 from __future__ import annotations
@@ -79,7 +79,7 @@ _Pair = Callable[..., Sequence[Any]]
 
 
 class Shortcut(NamedTuple):
-    """A faster version of a pair function, used if all pairs of atoms in a vector are close (see `far`)."""
+    """A faster version of a pair function for close atoms (see `far`)."""
 
     # whether a pair is far, from the arguments of a function of a pair
     far: Callable[..., Any]
@@ -99,7 +99,7 @@ def over_pairs(
     near: Shortcut | None = None,
     totals: int = 0,
 ) -> PairSums | None:
-    """Sum a pair function over the neighbor slots of every atom; use this function inside jit and on a CPU.
+    """Sum a pair function over the neighbors of every atom. Use it inside jit and on a CPU.
 
     Args:
         pair: a function of scalars: the columns of the atom, those of its neighbor, the pair type (None if
@@ -151,7 +151,7 @@ def over_pairs(
 
 
 def left_out(potential: Any) -> str | None:
-    """Return jax's name of an operation that the compiled loop does not support, or None if there is none."""
+    """Return jax's name of an operation that the compiled loop does not support, or None."""
     return _LEFT_OUT.get(jax.tree.structure(potential))
 
 
@@ -159,18 +159,18 @@ def left_out(potential: Any) -> str | None:
 
 
 class _NotKnown(Exception):
-    """Error for a jax operation without an LLVM counterpart; its message is the name of the operation."""
+    """Error for a jax operation without an LLVM counterpart. Its message is the operation's name."""
 
 
 class _Value(NamedTuple):
-    """Name of an LLVM vector whose numbers or decisions differ between pairs of atoms."""
+    """Name of an LLVM vector whose values differ between pairs of atoms."""
 
     name: str
     kind: str = "VEC"
 
 
 class _Written(NamedTuple):
-    """Source of a compiled loop, its numerical arguments, and the number of terms to sum."""
+    """Source of a compiled loop, and its numerical arguments."""
 
     loop: str
     constants: Array
@@ -220,7 +220,7 @@ def _number(value: Any, kind: str = "VEC") -> str:
 
 
 def _whole_power(equation: Any, inputs: list[Any]) -> int:
-    """Return the exponent if an operation is a power that is computed by products, and 0 otherwise."""
+    """Return the exponent if products compute a power, and 0 otherwise."""
     name, y = equation.primitive.name, inputs[-1]
     if name in ("square", "integer_pow"):
         return equation.params.get("y", 2)
@@ -239,11 +239,11 @@ def _written(
     inverses: bool,
     totals: int,
 ) -> _Written:
-    """Return the source of an LLVM function `word` that processes eight neighbor slots of a block of atoms.
+    """Return the source of an LLVM function `word` that processes eight neighbor slots.
 
-    The arguments of `word` are the number of atoms, the constants, the stride between slots (in atoms), and
-    an address for each array. The arrays are the columns of the atoms, the flags, sums, totals, decisions,
-    types and neighbors of the first slot, the smallest |margin| so far, and the table of atom data.
+    `word` takes the number of atoms, the constants, the stride between slots (in atoms), and an address for
+    each array. The arrays are: the columns of the atoms; flags, sums and totals; decisions, types and
+    neighbors of the first slot; the smallest |margin| so far; the table of atom data.
     """
     number, truth = jax.ShapeDtypeStruct((), np.float64), jax.ShapeDtypeStruct((), np.bool_)
     kind = jax.ShapeDtypeStruct((), np.uint8) if types else None
@@ -386,7 +386,7 @@ def _written(
         each.append("br i1 %distant.WIDE, label %far.WIDE, label %near.WIDE")
 
     def body(program: Any, place: str, totals: int) -> list[str]:
-        """Write the pair function as a block of LLVM text; return the names of the sums that it updates."""
+        """Write the pair function as a block of LLVM text. Return the names of its sums."""
         nonlocal lines
         before, lines = dict(made), []
         quotients.clear()
@@ -484,7 +484,7 @@ def _divide_once(
     powers: dict[str, tuple[str, int]],
     block: str,
 ) -> None:
-    """Replace divisions by powers of a number with multiplications by powers of its inverse.
+    """Replace divisions by powers of a number with products of its inverse.
 
     Args:
         block: name of the block to which the lines belong; names of inverse powers contain it.
@@ -504,7 +504,7 @@ def _divide_once(
 
 
 def _same(single: str, value: str, name: str, kind: str) -> str:
-    """Return LLVM text that makes a vector with the same value in every lane."""
+    """Return LLVM text of a vector with the same value in every lane."""
     return (
         f"{name}.first = insertelement {kind} poison, {single} {value}, i64 0\n  "
         f"{name} = shufflevector {kind} {name}.first, {kind} poison, <WIDE x i32> zeroinitializer"
@@ -521,7 +521,7 @@ def _of_width(text: str, wide: int) -> str:
 
 
 def _listed(rows: int, margins: bool) -> list[str]:
-    """Write code that tests whether eight neighbor slots are in use, and clears the slots' decisions."""
+    """Write code that tests which of eight slots are in use, and clears their decisions."""
     lines = []
     for k in range(8):
         lines += [
@@ -546,7 +546,7 @@ def _listed(rows: int, margins: bool) -> list[str]:
 
 
 def _others(wide: int, columns: int, rows: int) -> list[str]:
-    """Write LLVM code that loads and transposes the data of a slot's neighbors, four numbers at a time."""
+    """Write LLVM code that loads the data of a slot's neighbors, four numbers at a time."""
     parts = -(-columns // 4)
     lines = [
         f"%at.WIDE = getelementptr i32, ptr %r{rows - 3}, i64 %from.WIDE",
@@ -651,7 +651,7 @@ define i64 @called(i64 %frame) {{
 
 @cache
 def _registered(source: str, cpu: str = "") -> str:
-    """Compile a loop for the named processor (default: this one) and register it; return its name in XLA."""
+    """Compile a loop for a processor (default: this one) and register it. Return its name in XLA."""
     name = f"mdnum_pairs_{cpu}{hashlib.sha256(source.encode()).hexdigest()[:16]}"
     features = "" if cpu else llvm.get_host_cpu_features().flatten()
     machine = llvm.Target.from_default_triple().create_target_machine(
@@ -682,7 +682,7 @@ def _filled(out_at, n, value):
 
 @njit
 def _interleaved(columns_at, columns, atoms, table_at, apart):
-    """Write the data of all atoms to a table, atom by atom, and a row of NaN for padding entries."""
+    """Write the data of all atoms to a table, atom by atom. Padding becomes a row of NaN."""
     of = carray(pointer(columns_at), (columns * atoms,), np.float64)
     table = carray(pointer(table_at), ((atoms + 1) * apart,), np.float64)
     for k in range(atoms):
@@ -709,7 +709,7 @@ _USERS, _NEXT, _DONE, _BLOCKS, _FRAME, _WORD, _TABLE, _THREADS, _ASKED, _NEAREST
 
 @njit
 def _work(job):
-    """Process the blocks of atoms that other threads have not taken, one by one, until no block is left."""
+    """Process the blocks of atoms that no other thread has taken, until none is left."""
     block, blocks = added(job + 8 * _NEXT, 1), peek(job, _BLOCKS)
     if block >= blocks:
         return
@@ -763,7 +763,7 @@ def _leave(job):
 
 
 def _help(job):
-    """Task of a helper thread: process blocks of atoms of a job, then release the job."""
+    """Task of a helper thread: process blocks of a job, then release it."""
     _work(job)
     _leave(job)
     return 0
@@ -771,7 +771,7 @@ def _help(job):
 
 @njit
 def _helped(job, frame, helpers, task):
-    """Schedule helper threads of XLA for a job; if this fails, the calling thread does all the work."""
+    """Schedule helper threads of XLA. If this fails, the calling thread does all the work."""
     api, asked = peek(frame, 2), job + 8 * _ASKED
     schedule, ask = peek(api, 17), peek(api, 18)
     poke(asked, 0, 32)
@@ -791,7 +791,7 @@ def _helped(job, frame, helpers, task):
 
 
 def _over_blocks(frame, word, task):
-    """Process all blocks of atoms for `over_pairs`, in a call from XLA; return 0 (no error).
+    """Process all blocks of atoms for `over_pairs` in a call from XLA. Return 0 (no error).
 
     Args:
         frame: address of XLA's call frame. word, task: addresses of the loop over a word, and of `_help`.

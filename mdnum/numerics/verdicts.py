@@ -1,14 +1,13 @@
-"""When two runs that differ in one setting diverge, how fast, and whether flips are the cause.
+"""When two runs diverge, how fast, and whether flips are the cause.
 
 A flip is a cutoff decision that differs between two runs. The verdict compares the second run with a
-counterfactual run. The counterfactual run has the arithmetic of the second run but the cutoff decisions of
-the first run. If the counterfactual run stays close to the first run, the flips caused the split. If the
-counterfactual run also splits, repeats of both runs decide whether the flips made the split occur earlier.
-Repeats are evaluated by a sequential sign test. Assume that removing the flips delays the split of a pair of
-runs with a probability of at most 1/2. Then the probability that k or more of n splits are delayed is at most
-that of k or more heads in n coin tosses. The initial displacements of all repeats have the same size. If most
-repeats with displacements of another size disagree, there is no verdict. Error rates are listed in
-docs/verdict-calibration.md.
+counterfactual run. The counterfactual run has the arithmetic of run B, but the cutoff decisions of run A. If
+it stays close to run A, the flips caused the split. If it also splits, repeats of both runs decide. They show
+whether the flips made the split occur earlier. Repeats are evaluated by a sequential sign test. Assume that
+removing the flips delays a split with a probability of at most 1/2. Then k or more of n splits are delayed at
+most as often as n coin tosses give k or more heads. The initial displacements of all repeats have the same
+size. If most repeats with displacements of another size disagree, there is no verdict. Error rates are listed
+in docs/verdict-calibration.md.
 """
 
 from __future__ import annotations
@@ -34,7 +33,7 @@ _ALIKE = 4
 
 @dataclass(frozen=True)
 class Delay:
-    """The steps at which two runs split, without and with run A's decisions imposed on run B."""
+    """The steps at which two runs split, without and with run A's decisions in run B."""
 
     # free, imposed: steps of the two splits; None for one that was not seen
     free: int | None
@@ -45,12 +44,12 @@ class Delay:
 
     @classmethod
     def of(cls, free: Float[np.ndarray, "steps"], imposed: Float[np.ndarray, "steps"], tolerance: float):
-        """Create a `Delay` from the distance between two runs by step, without and with imposed decisions."""
+        """Create a `Delay` from the distance between two runs at each step."""
         splits = (split_of(run, tolerance) for run in (free, imposed))
         return cls(*splits, free_until=_last_seen(free), imposed_until=_last_seen(imposed))
 
     def beyond(self, steps: float) -> bool | None:
-        """Return whether the runs split more than `steps` steps later without the flips; None if unknown."""
+        """Return whether the split is more than `steps` steps later without the flips. None if unknown."""
         if self.free is not None and self.imposed is not None:
             return self.imposed - self.free > steps
         if self.free is not None:
@@ -62,11 +61,11 @@ class Delay:
 
 @cache
 def looks(pairs: int, error: float = ERROR) -> tuple[tuple[int, int], ...]:
-    """Return, for each stage of the sign test, the number of pairs of runs and how many of them must agree.
+    """Return the number of pairs of runs at each stage of the sign test, and how many must agree.
 
-    The allowed error probability is used up in proportion to the number of pairs of runs (Lan and DeMets,
-    Biometrika 70, 659, 1983). For fair coin tosses, the probability of a result up to a given stage is at
-    most the error probability times the fraction of pairs of runs used until then.
+    The allowed error probability is used up in proportion to the number of pairs (Lan and DeMets, Biometrika
+    70, 659, 1983). Fair coin tosses give a result up to a stage with a limited probability. The limit is the
+    error probability times the fraction of pairs used so far.
 
     Args:
         pairs: largest number of pairs of runs.
@@ -100,7 +99,7 @@ FEWEST = next(pairs for pairs in range(1, 2 + REPEATS) if looks(pairs)) - 1
 
 @dataclass(frozen=True)
 class Count:
-    """Numbers of pairs of runs for which removing the flips delays, or does not delay, the split."""
+    """Numbers of pairs of runs that split later, or not later, without flips."""
 
     pairs: int  # that were run, the pair itself among them
     later: int  # that were delayed by more than asked for
@@ -114,7 +113,7 @@ class Count:
 
     @property
     def delayed(self) -> bool | None:
-        """Whether most pairs of runs split later without flips, or None if the sign test has no result."""
+        """Whether most pairs of runs split later without flips. None if the sign test has no result."""
         need = dict(looks(self.most)).get(self.pairs)
         if need is None:
             return None
@@ -122,14 +121,14 @@ class Count:
 
     @property
     def majority(self) -> bool | None:
-        """Whether most pairs of runs split later without flips, or None if more pairs of runs are needed."""
+        """Whether most pairs of runs split later without flips. None if more pairs are needed."""
         if self.later > self.most / 2 or self.later == self.pairs >= _ALIKE:
             return True
         return False if self.not_later > self.most / 2 or self.not_later == self.pairs >= _ALIKE else None
 
     @property
     def wanted_for_majority(self) -> int:
-        """Smallest number of further pairs of runs that can decide the majority; 0 if none are needed."""
+        """Smallest number of further pairs of runs that can decide the majority."""
         if self.pairs < _ALIKE:
             return _ALIKE - self.pairs
         more = self.most // 2 + 1 - max(self.later, self.not_later)
@@ -137,14 +136,14 @@ class Count:
 
     @property
     def wanted(self) -> int:
-        """Number of pairs of runs to simulate before the sign test's next stage; 0 if the test has ended."""
+        """Number of pairs of runs to simulate before the next stage. 0 if the test has ended."""
         if self.delayed is not None:
             return 0
         return next((end - self.pairs for end, _ in looks(self.most) if end > self.pairs), 0)
 
 
 def count(delays: tuple[Delay, ...], steps: float, most: int) -> Count:
-    """Count the pairs of runs that split more than a given number of steps later without the flips.
+    """Count the pairs of runs that split more than `steps` steps later without flips.
 
     Args:
         delays: delays of the pair itself and of its repeats.
@@ -186,7 +185,7 @@ _HALF = 3.0
 
 @dataclass(frozen=True)
 class Dates:
-    """The first steps at which two runs differ in bits of the state, differ in decisions, and split."""
+    """The first steps at which two runs differ in bits, differ in decisions, and split."""
 
     first_bit: int | None  # first step whose state bits differ
     fork: int | None  # first step whose decisions differ
@@ -195,7 +194,7 @@ class Dates:
 
 @dataclass(frozen=True)
 class Growth:
-    """Exponential growth of the distance between two runs, from a linear fit to its logarithm."""
+    """Exponential growth of the distance between two runs, from a fit to its logarithm."""
 
     rate: float  # per step; NaN where too few rows could be fitted
     r_squared: float  # of the fit
@@ -205,15 +204,15 @@ class Growth:
 
     @property
     def plain(self) -> bool:
-        """True if the distance between two runs clearly grows, so that the fit is not a fit of noise."""
+        """True if the distance clearly grows. The fit is then not a fit of noise."""
         return bool(np.isfinite(self.rate) and self.rate > 0 and self.r_squared > FITS)
 
 
 def growth_rate(log: Float[np.ndarray, "rows"]) -> tuple[float, float, bool]:
-    """Return the growth rate of a quantity, its standard error, and whether growth is faster than linear.
+    """Return the growth rate, its standard error, and whether growth is faster than linear.
 
     The rate is the slope of the quantity's logarithm in the later rows. The error is estimated from blocks of
-    rows. The result is NaN, NaN, False if there are too few data rows, or if numbers are not finite.
+    rows. The result is NaN, NaN, False if there are too few rows, or if numbers are not finite.
     """
     rows = np.flatnonzero(np.isfinite(log))
     if not len(rows) or len(log) < 10 * BLOCKS:
@@ -231,21 +230,21 @@ def growth_rate(log: Float[np.ndarray, "rows"]) -> tuple[float, float, bool]:
 
 
 def split_of(separation: Float[np.ndarray, "steps"], tolerance: float) -> int | None:
-    """Return the first step at which the distance between two runs exceeds the tolerance, or None."""
+    """Return the first step at which the distance exceeds the tolerance, or None."""
     beyond = separation > tolerance
     return int(beyond.argmax()) if beyond.any() else None
 
 
 def _last_seen(separation: Float[np.ndarray, "steps"]) -> int:
-    """Return the last step at which the distance between two runs is known, or -1 if it is never known."""
+    """Return the last step at which the distance between two runs is known, or -1."""
     seen = np.flatnonzero(np.isfinite(separation))
     return int(seen[-1]) if len(seen) else -1
 
 
 def growth(separation: Float[np.ndarray, "steps"], tolerance: float) -> Growth:
-    """Fit the exponential growth rate of the distance between two runs, before the distance saturates.
+    """Fit the exponential growth rate of the distance between two runs.
 
-    The fit uses steps before the split, with distances between 1e-12 and 0.1 times the tolerance. Steps up to
+    The fit uses steps before the split with distances between 1e-12 and 0.1 times the tolerance. Steps up to
     the last distance below 1e-12 times the tolerance are omitted. A low r_squared of the fit indicates noise.
 
     Args:
@@ -266,7 +265,7 @@ def growth(separation: Float[np.ndarray, "steps"], tolerance: float) -> Growth:
 
 
 def _line(x: np.ndarray, y: np.ndarray) -> tuple[float, float]:
-    """Return the slope and r² of a straight line that is fitted to points."""
+    """Return the slope and r² of a line fitted to points."""
     slope, base = np.polyfit(x, y, 1)
     spread = float(np.sum((y - y.mean()) ** 2))
     return float(slope), 1.0 - float(np.sum((y - slope * x - base) ** 2)) / spread if spread > 0 else 0.0
@@ -275,10 +274,10 @@ def _line(x: np.ndarray, y: np.ndarray) -> tuple[float, float]:
 def expected(
     separation: Float[np.ndarray, "steps"], tolerance: float, exponent: float | None = None
 ) -> float | None:
-    """Predict the number of further steps until two runs split, or return None if this is impossible.
+    """Predict the number of further steps until two runs split. None if this is impossible.
 
     A prediction requires continued exponential growth. In the later half of the fitted steps, the distance
-    between the runs must grow by several e-foldings, at a rate within a factor of 2 of the overall rate.
+    must grow by several e-foldings. The rate must be within a factor of 2 of the overall rate.
 
     Args:
         separation: of each step, length; NaN after a run ended.
@@ -306,7 +305,7 @@ def expected(
 
 @dataclass(frozen=True)
 class ForkVerdict:
-    """Verdict on whether flips caused the split of two runs, made it occur earlier, or had no effect."""
+    """Verdict on whether flips caused the split of two runs."""
 
     # "same" (no bit differs), "no fork" (no decision differs), "open" (no split within the horizon, or no
     # counterfactual that was followed far enough), "cause" (without the flips no split), "accelerated" (most
@@ -330,7 +329,7 @@ class ForkVerdict:
 
     @property
     def wanted(self) -> int:
-        """Number of repeats to run before the next stage of the test; 0 if no further repeats are needed."""
+        """Number of repeats to run before the next stage of the test."""
         if self.other is not None:
             return self.other.wanted_for_majority
         return self.count.wanted if self.count is not None else 0
@@ -347,7 +346,7 @@ def judge(
     other: Sequence[Delay] = (),
     ended: Mapping[str, Any] | None = None,
 ) -> ForkVerdict:
-    """Return the verdict on whether flips caused the split of a pair of runs, or made it occur earlier.
+    """Return the verdict on whether flips caused the split of two runs, or made it earlier.
 
     Args:
         dates: steps at which the pair of runs diverges.
@@ -396,9 +395,9 @@ def _counted(
     gained: float,
     reasons: tuple[Reason, ...],
 ) -> ForkVerdict:
-    """Return the verdict on runs that split despite imposed decisions, from the count of delayed splits.
+    """Return the verdict on runs that split despite imposed decisions.
 
-    Repeats with displacements of another size can only withdraw a verdict, so they add no false verdicts.
+    Repeats with displacements of another size can only withdraw a verdict.
     """
     pair = delays[0][0]
     threshold = 0.0 if rate is None else E_FOLDINGS / rate
@@ -433,7 +432,7 @@ def _kept(
     most: int,
     rate: float | None,
 ) -> ForkVerdict:
-    """Return the verdict on runs that do not split if run A's decisions are imposed on run B."""
+    """Return the verdict on runs that do not split if run B gets run A's decisions."""
     seen = max(0, _last_seen(imposed))
     reach = float(np.nanmax(imposed, initial=0.0))
     below = float(np.log(tolerance / reach)) if reach > 0 else float("inf")
@@ -451,7 +450,7 @@ def _kept(
 
 
 def _outlook(free: Float[np.ndarray, "steps"], tolerance: float) -> tuple[Reason, ...]:
-    """Return reasons for the verdict on runs without a split: their last distance, and its growth."""
+    """Return reasons for the verdict on runs that did not split."""
     seen = float(free[np.isfinite(free)][-1])
     now: Reason = ("outlook", {"steps": len(free) - 1, "separation": seen, "tolerance": tolerance})
     more = expected(free, tolerance)
@@ -461,7 +460,7 @@ def _outlook(free: Float[np.ndarray, "steps"], tolerance: float) -> tuple[Reason
 
 
 def _expected(separation: Float[np.ndarray, "steps"], tolerance: float, seen: int) -> float | None:
-    """Predict when a counterfactual run splits from run A, or return None if their distance does not grow."""
+    """Predict when a counterfactual run splits from run A. None if their distance does not grow."""
     fit = growth(separation[: seen + 1], tolerance)
     now = float(separation[seen])
     if not (fit.plain and now > 0):
@@ -506,7 +505,7 @@ class SplitCell:
 
 @dataclass(frozen=True)
 class Share:
-    """Number of steps by which a difference in decisions, or in arithmetic, makes two runs split earlier."""
+    """Number of steps by which different decisions, or arithmetic, make the split earlier."""
 
     what: What  # the difference that is taken away; the other one stays
     reference: Name  # the run that is compared with
@@ -516,7 +515,7 @@ class Share:
 
 
 def table(series: Mapping[str, Shaped[np.ndarray, "steps"]], tolerance: float) -> tuple[SplitCell, ...]:
-    """Return when runs with the arithmetic of A or B and the decisions of A or B split from A and from B.
+    """Return when runs with the arithmetic and decisions of A or B split from A and from B.
 
     Args:
         series: separations at each step, length, by the names "B" and those in SERIES; NaN after a run ended.
@@ -541,7 +540,7 @@ def table(series: Mapping[str, Shaped[np.ndarray, "steps"]], tolerance: float) -
 
 
 def shares(cells: tuple[SplitCell, ...], rate: float) -> tuple[Share, ...]:
-    """Return by how many steps different decisions, or arithmetic, make the split of runs A and B earlier.
+    """Return by how many steps different decisions, or arithmetic, make the split earlier.
 
     Args:
         cells: result of `table`.

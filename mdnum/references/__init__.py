@@ -1,6 +1,6 @@
 """Reference results from ASE, numpy and neighbor searches; also an ASE calculator that uses mdnum.
 
-Modules are imported at first use, since importing ASE, MDAnalysis or jax takes a second or more.
+Modules are imported at first use. Importing ASE, MDAnalysis or jax takes a second or more.
 """
 
 from __future__ import annotations

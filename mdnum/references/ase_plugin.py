@@ -1,4 +1,4 @@
-"""Module that ASE imports to register mdnum as a plugin; it imports no other module of mdnum."""
+"""Module that registers mdnum as a plugin of ASE. It imports no other module of mdnum."""
 
 from __future__ import annotations
 

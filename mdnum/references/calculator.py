@@ -48,7 +48,7 @@ def _of_system(system: Simulation | System) -> _Recipe:
 
 
 def _of_potential(potential: Any, cutoff: Any, unit: str) -> _Recipe:
-    """Return a recipe for simulations with a potential, given as objects or as tables of a system file."""
+    """Return a recipe for simulations with a potential."""
     if isinstance(potential, Mapping):
         made = interaction(potential, cutoff)
         end, model = made.cutoff, lambda atoms: model_of(made, atoms, Path())
@@ -76,9 +76,9 @@ def _of_potential(potential: Any, cutoff: Any, unit: str) -> _Recipe:
 class MdnumCalculator(ClassicalCalculator):
     """ASE calculator that evaluates a potential with mdnum.
 
-    Use this calculator to relax structures with ase.optimize, to compute stress and equations of state, and
-    to analyze mdnum's forces by means of ASE. The Verlet list is kept until atoms or box have moved farther
-    than its skin allows. For molecular dynamics, use the function `rollout` of mdnum, which records flips.
+    Use this calculator to relax structures with ase.optimize, or to compute stress and equations of state.
+    The Verlet list is kept until atoms or box have moved too far for its skin. For molecular dynamics, use
+    the function `rollout` of mdnum, which records flips.
 
     Args:
         system: a `Simulation`, a `System`, or the name or path of a system file; the evaluated atoms may
@@ -133,7 +133,7 @@ class MdnumCalculator(ClassicalCalculator):
         return None if self._evaluator is None else self._evaluator.simulation
 
     def set(self, **changes: Any) -> dict[str, Any]:
-        """Raise an error if a parameter is changed; for another potential, create another calculator.
+        """Raise an error if a parameter is changed. Another potential needs another calculator.
 
         Raises:
             TypeError: a parameter was given.
@@ -168,7 +168,7 @@ class MdnumCalculator(ClassicalCalculator):
         return results
 
     def _made_for(self, atoms: Atoms) -> Evaluator:
-        """Return a function that evaluates the given atoms at any positions and in any cell."""
+        """Return a function that evaluates the atoms at any positions and in any cell."""
         # only what the forces depend on: constraints and the like stay with ASE
         bare = Atoms(numbers=atoms.numbers, positions=atoms.positions, cell=atoms.cell, pbc=atoms.pbc)
         if self._given is not None:

@@ -1,4 +1,4 @@
-"""Plots made with plain matplotlib, in one style and one width, as SVG figures that adapt to the page."""
+"""Plots made with matplotlib, as SVG figures that adapt to the page."""
 
 from __future__ import annotations
 
@@ -88,7 +88,7 @@ def canvas(draw_into: Callable[[Canvas], None], height: float) -> Canvas:
 
 
 def line(axes: Axes, x: np.ndarray, y: np.ndarray, color: str, label: str = "", **look: object) -> None:
-    """Draw a line; with too many points, draw averages and a band from smallest to largest values."""
+    """Draw a line. For too many points, draw averages and a band from smallest to largest values."""
     low, middle, high, at = envelope(np.asarray(x), np.asarray(y))
     if len(y) > POINTS:
         axes.fill_between(at, low, high, color=color, alpha=0.3, lw=0)
@@ -98,7 +98,7 @@ def line(axes: Axes, x: np.ndarray, y: np.ndarray, color: str, label: str = "", 
 def envelope(
     x: np.ndarray, y: np.ndarray, most: int = POINTS
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """Divide points into at most `most` groups; return smallest, mean and largest y and mean x of each."""
+    """Divide points into at most `most` groups. Return smallest, mean and largest y, and mean x."""
     if len(y) <= most:
         return y, y, y, x
     starts = np.unique(np.linspace(0, len(y), most, endpoint=False).astype(int))
@@ -112,7 +112,7 @@ def envelope(
 
 
 def legend(axes: Axes) -> None:
-    """Draw a legend with the names of the lines above the axes, where it covers no data."""
+    """Draw a legend above the axes, where it covers no data."""
     handles, labels = axes.get_legend_handles_labels()
     if handles:
         longest = max(len(label) for label in labels)
@@ -123,7 +123,7 @@ def legend(axes: Axes) -> None:
 
 
 def notes(plot: Figure | Plot) -> list[str]:
-    """Return a sentence for each kind of value that a plot cannot show, such as infinite values."""
+    """Return a sentence for each kind of value that a plot cannot show."""
     if isinstance(plot, Figure) or not plot.series:
         return []
     sentences = []
@@ -180,7 +180,7 @@ def _plot(plot: Plot, figure: Canvas) -> None:
 
 
 def _high(curves: list[Line2D], axes: Axes, x: float) -> bool:
-    """Return True if, near x, curves pass through the upper but not the lower part of the axes."""
+    """Return True if curves near x pass only through the upper part of the axes."""
     to_axes = axes.transData + axes.transAxes.inverted()
     points = [to_axes.transform(np.asarray(one.get_xydata(), float)) for one in curves]
     at = np.concatenate(points or [np.zeros((0, 2))])
@@ -198,7 +198,7 @@ def _values(plot: Plot, name: str) -> np.ndarray:
 
 
 def _base(plot: Plot, name: str) -> float:
-    """Return an offset for an axis whose values differ only in their last digits; otherwise 0."""
+    """Return an offset for an axis whose values differ only in their last digits, else 0."""
     values = _values(plot, name)
     span = np.ptp(values) if len(values) else 0.0
     # differences of neighboring floats are exact, so none of them is lost
@@ -218,7 +218,7 @@ def _coincide(one: Series, other: Series) -> bool:
 def _apart(
     marks: tuple[tuple[float, str], ...], base: float, limits: tuple[float, float]
 ) -> list[tuple[float, str]]:
-    """Return marked values with labels, and join the labels of values that are too close together."""
+    """Return marked values with labels. Labels of close values are joined."""
     kept: list[tuple[float, str]] = []
     near = 0.025 * abs(limits[1] - limits[0])
     for value, word in sorted((value - base, word) for value, word in marks):
@@ -245,7 +245,7 @@ def _scale(axes: Axes, name: str, scale: str, plot: Plot) -> None:
 
 
 def _series(axes: Axes, series: Series, bases: dict[str, float], covered: int) -> None:
-    """Draw a series of points, with a broader line if later series would hide it."""
+    """Draw a series of points. The line is broader if later series would hide it."""
     x, y = (np.asarray(getattr(series, name), float) - bases[name] for name in "xy")
     # what is infinite, or too large for an axis to have room beyond it, leaves a gap
     there = (np.abs(x) < 1e250) & (np.abs(y) < 1e250)
@@ -286,7 +286,7 @@ def _region(axes: Axes, region: Region) -> None:
 
 
 def _edges(centers: np.ndarray, log: bool) -> np.ndarray:
-    """Return the edges of cells around given centers, halfway between adjacent centers on the axis scale."""
+    """Return the edges of cells, halfway between adjacent centers on the axis scale."""
     centers = np.log(centers) if log else np.asarray(centers, float)
     half = np.diff(centers) / 2 if len(centers) > 1 else np.array([0.5])
     edges = np.concatenate(
@@ -296,7 +296,7 @@ def _edges(centers: np.ndarray, log: bool) -> np.ndarray:
 
 
 def _named(names: tuple[str, ...], value: float, _: int | None = None) -> str:
-    """Return the label of an integer position on an axis, or an empty string at any other position."""
+    """Return the label of a power of ten on a logarithmic axis, or an empty string."""
     return names[round(value)] if value == round(value) and 0 <= value < len(names) else ""
 
 
@@ -318,7 +318,7 @@ def _engineering() -> ScalarFormatter:
 
 
 def thin_line(x: Float[np.ndarray, "points"], y: Float[np.ndarray, "points"]) -> Int[np.ndarray, "kept"]:
-    """Select points of a line to keep: at most four per bin (first, lowest, highest, last), and all gaps.
+    """Select at most four points of a line per bin (first, lowest, highest, last). All gaps are kept.
 
     Args:
         x: positions on the scale of the axis (logarithms on a logarithmic axis), NaN for a gap.
@@ -347,7 +347,7 @@ def thin_line(x: Float[np.ndarray, "points"], y: Float[np.ndarray, "points"]) ->
 
 
 def thin_points(x: Float[np.ndarray, "points"], y: Float[np.ndarray, "points"]) -> Int[np.ndarray, "kept"]:
-    """Select points of a scatter plot to keep: one point in each occupied cell of a fine grid.
+    """Select one point of a scatter plot in each occupied cell of a fine grid.
 
     Args:
         x, y: coordinates on the scales of the axes.
@@ -374,7 +374,7 @@ def thin_points(x: Float[np.ndarray, "points"], y: Float[np.ndarray, "points"]) 
 
 
 def style() -> AbstractContextManager[None]:
-    """Return a context with the settings for all figures, in place of the user's matplotlibrc."""
+    """Return a context with the matplotlib settings for all figures."""
     return mpl.rc_context(
         {
             # any backend will do, and to ask for the one in use imports pyplot
@@ -395,7 +395,7 @@ def style() -> AbstractContextManager[None]:
 
 
 def markup(figure: Canvas, name: str) -> str:
-    """Return a figure as an <svg> element in which colors are named by role, to adapt to the page.
+    """Return a figure as an <svg> element whose colors are named by role.
 
     Args:
         name: prefix that makes the ids of the element unique on a page.
@@ -425,13 +425,13 @@ def markup(figure: Canvas, name: str) -> str:
 
 
 def inline(text: str, title: str) -> str:
-    """Return an <svg> element for an HTML page that defines its colors as custom properties."""
+    """Return an <svg> element for an HTML page that defines its colors."""
     text = re.sub(r'<svg [^>]*?viewBox="([^"]+)"[^>]*>', r'<svg viewBox="\1" role="img">', text, count=1)
     return text.replace('role="img">', f'role="img" aria-label="{escape(title)}">', 1)
 
 
 def standalone(text: str) -> str:
-    """Return a complete SVG file with light and dark colors, selected by the viewer's preference."""
+    """Return a complete SVG file with light and dark colors."""
     rules = (
         f"svg {{ {_properties(LIGHT)} }} "
         f"@media (prefers-color-scheme: dark) {{ svg {{ {_properties(DARK)} }} }} "

@@ -29,13 +29,13 @@ Loss = Callable[[Simulation, Float[np.ndarray, "atoms 3"], Float[np.ndarray, "at
 
 
 def squared_displacement(simulation: Simulation, x: np.ndarray, v: np.ndarray) -> float:
-    """Return the mean squared displacement of the atoms from the start (length²), the default loss."""
+    """Return the mean squared displacement (length²) from the start. It is the default loss."""
     return float(np.mean(np.sum((x - simulation.positions) ** 2, axis=1)))
 
 
 @dataclass(frozen=True)
 class MdProgram:
-    """A simulation with an initial state, and the mapping of its atoms and axes to another simulation."""
+    """A simulation with an initial state. Its atoms and axes are mapped to another simulation."""
 
     simulation: Simulation  # the system as objects
     begin: Start | None = None  # its start; None for the system's own
@@ -64,18 +64,18 @@ class MdProgram:
 
     @property
     def ulp(self) -> float:
-        """Unit in the last place (ulp) of the largest initial coordinate, as a length."""
+        """Unit in the last place (ulp) of the largest initial coordinate (length)."""
         x = np.asarray(self.start.state.x)
         return float(np.spacing(np.abs(x).max().astype(x.dtype)))
 
     @property
     def streams(self) -> bool:
-        """Whether runs can be continued: always True, because a run can have any number of steps."""
+        """Whether runs can be continued: always True."""
         return True
 
     @property
     def imposable(self) -> str | None:
-        """Reason why decisions cannot be imposed on this simulation; None if they can be imposed."""
+        """Reason why decisions cannot be imposed on this simulation, or None."""
         if self.simulation.imposable:
             return None
         return "a many-body potential decides inside its energy function"
@@ -100,7 +100,7 @@ class MdProgram:
     def lockstep(
         self, other: MdProgram, last: int, *, forward: bool, back: bool, guard: float | None
     ) -> Iterator[PairRows]:
-        """Advance two runs and their counterfactual runs, one segment at a time (see `Program.lockstep`)."""
+        """Advance two runs and their counterfactual runs by segments (see `Program.lockstep`)."""
         a, b = self.simulation, other.simulation
         frame, imposed = other.frame or ReferenceFrame.same(a.atoms), {}
         if forward:
@@ -135,7 +135,7 @@ class MdProgram:
     def nudged(self, size: float, count: int, seed: int) -> list[MdProgram]:
         """Return randomly displaced copies of the simulation; the largest displacement is about `size`.
 
-        The largest displacement is at least one ulp of a coordinate; rounding removes smaller displacements.
+        The largest displacement is at least one ulp of a coordinate.
         """
         rng = np.random.default_rng(seed)
         x, ulp = np.asarray(self.start.state.x), self.ulp
@@ -150,7 +150,7 @@ class MdProgram:
         return programs
 
     def decision(self, other: MdProgram, flips: Sequence[CrossFlip], separation: float) -> Decision:
-        """Return the cutoff decision that differs between two runs, for the pair nearest to the cutoff."""
+        """Return the differing cutoff decision of the pair nearest to the cutoff."""
         differing = [flip for flip in flips if flip.differs]
         flip = min(differing, key=lambda flip: abs(flip.margin) if np.isfinite(flip.margin) else np.inf)
         if np.isfinite(flip.margin):
@@ -170,7 +170,7 @@ class MdProgram:
         )  # fmt: skip
 
     def number(self, key: str) -> Number:
-        """Return the numerical parameter of the system that has a given path (such as "cutoff.radius")."""
+        """Return the numerical parameter at a path (such as "cutoff.radius")."""
         simulation = self.simulation
         name = parameters.resolve(simulation, key, parameters.numbers(simulation))
 
@@ -181,7 +181,7 @@ class MdProgram:
         return Number(name, here, unit, at, parameters.is_positive(simulation, name))
 
     def history(self, steps: int, loss: Loss | None = None) -> DecisionHistory:
-        """Return all decisions of a run and its loss, by default the mean squared displacement."""
+        """Return all decisions of a run and its loss."""
         marks: list[np.uint64] = []
         segment = None
         for segment in Engine(self.simulation, steps, start=self.begin).segments():
@@ -203,7 +203,7 @@ class MdProgram:
         return DecisionHistory(every, digest, x, value, energy, failed)
 
     def differing(self, other: MdProgram, steps: int, step: int, key: str = "") -> Differing:
-        """Return the pair nearest to the cutoff among all pairs with different decisions at a step."""
+        """Return the pair nearest to the cutoff among pairs with different decisions."""
         sides = [one._pairs_at(steps, step) for one in (self, other)]
         keys = np.setxor1d(sides[0][0], sides[1][0], assume_unique=True)
         pairs = [divmod(int(key), self.size) for key in keys]
@@ -219,7 +219,7 @@ class MdProgram:
         return Differing(nearest)
 
     def _pairs_at(self, steps: int, step: int) -> tuple[Int[np.ndarray, "inside"], Simulation, np.ndarray]:
-        """Return pairs inside the cutoff at one step, the simulation with this step's box, and positions."""
+        """Return pairs inside the cutoff at one step, the simulation with its box, and positions."""
         for segment in Engine(self.simulation, steps, start=self.begin).segments():
             if segment.last >= step:
                 row = step - segment.first
@@ -228,7 +228,7 @@ class MdProgram:
         raise IndexError(f"the run has no step {step}")
 
     def state_at(self, step: int, last: int) -> tuple[Simulation, Float[np.ndarray, "atoms 3"]] | None:
-        """Return a simulation with one step's box, and wrapped positions; None if the run ended earlier."""
+        """Return a simulation with one step's box, and wrapped positions. None if the run ended earlier."""
         track = Track(self.simulation, last, self.begin, self.frame, flips=False)
         while track.segment() is not None:
             rows = track.until(track.ready)
@@ -242,7 +242,7 @@ class MdProgram:
 def pair_margin(
     simulation: Simulation, x: Float[np.ndarray, "atoms 3"], i: int, j: int, labels: Simulation | None = None
 ) -> float:
-    """Return the margin (threshold minus r or r²) of a pair of atoms, bit for bit as computed in a run.
+    """Return the margin (threshold minus r or r²) of a pair, bit for bit as in a run.
 
     Args:
         x: wrapped positions, length.
@@ -255,6 +255,6 @@ def pair_margin(
 
 
 def pair_bound(simulation: Simulation, x: Float[np.ndarray, "atoms 3"], i: int, j: int) -> float:
-    """Return a bound on the rounding error of r or r² of a pair at the given positions."""
+    """Return a bound on the rounding error of r or r² of a pair."""
     kind = int(simulation.type_of(np.array([i]), np.array([j]))[0])
     return float(simulation.decider.bounds_at(x.T[None])[0, kind])

@@ -1,4 +1,4 @@
-"""`mdnum conform`: a conformance suite, which tests whether a neighbor list contains the right pairs."""
+"""`mdnum conform`: tests whether a neighbor list contains the right pairs."""
 
 from __future__ import annotations
 
@@ -76,7 +76,7 @@ class Options:
 
 @dataclass
 class Examination(CaseAnswers):
-    """State of the examination of a neighbor list, stored in answers.json to resume the examination."""
+    """State of an examination, stored in answers.json to resume it."""
 
     word: str = field(kw_only=True)  # what names the list; empty where it has no name
     tested: tuple[str, str | None] = field(kw_only=True)  # name and version of the list
@@ -103,7 +103,7 @@ def conform(
 ) -> Outcome:
     """Test a neighbor list with the conformance suite: does the list contain the right pairs?
 
-    Each result is saved at once, so that an interrupted examination can be continued with `resume`.
+    Each result is saved at once. `resume` continues an interrupted examination.
 
     Example:
         >>> mdnum.conform("vesin", time=60)
@@ -225,7 +225,7 @@ def conform(
 
 
 def command(pairs: str | None = None, *, resume: Path | None = None, **given: Any) -> Outcome | Reply:
-    """Execute `mdnum conform`; if no neighbor list is given, print the names of known neighbor lists."""
+    """Execute `mdnum conform`. Without a neighbor list, print the names of known ones."""
     from mdnum.references.conformance.peers import known
 
     if pairs is not None or resume is not None:
@@ -241,12 +241,12 @@ def command(pairs: str | None = None, *, resume: Path | None = None, **given: An
 
 
 def _script(code: str) -> str:
-    """Return the ending of the file name for a script that reproduces failures with the given code."""
+    """Return the ending of a script's file name for failures with the given code."""
     return f"{code.lower().replace('_', '-')}.py"
 
 
 def _write_scripts(folder: RunFolder, found: Report) -> list[str]:
-    """Write a script to reproduce each failure, remove obsolete scripts, and return the file names."""
+    """Write a script for each failure and remove obsolete scripts. Return the file names."""
     from mdnum.references.conformance.reproduction import script
 
     scripts = []
@@ -267,7 +267,7 @@ def _write_scripts(folder: RunFolder, found: Report) -> list[str]:
 
 
 def summary_of(found: Report, scripts: list[str], seed: int) -> dict[str, Any]:
-    """Return the content of an examination's summary.json; `scripts` are file names, one per failure."""
+    """Return the content of an examination's summary.json."""
     tested = found.tested
     own = ("superset", "found_out", "keeps_order", "shifts", "aliased", "questions", "left", "breadth",
            "running", "padding", "asked", "wrong", "conforms", "seconds")  # fmt: skip
@@ -320,7 +320,7 @@ def summary_of(found: Report, scripts: list[str], seed: int) -> dict[str, Any]:
 
 
 def _cases(summary: Mapping[str, Any], code: str) -> int:
-    """Return the number of test cases in which the most severe failure has the given code."""
+    """Return the number of test cases whose most severe failure has the given code."""
     return sum(row["codes"].get(code, 0) for row in summary["areas"])
 
 
@@ -329,7 +329,7 @@ def _total(summary: Mapping[str, Any], name: str) -> int:
 
 
 def judge(view: View) -> Verdict:
-    """Return the verdict on a neighbor list (headline, evidence and findings), from its folder alone."""
+    """Return the verdict on a neighbor list from its folder."""
     summary = view.summary
     asked, wrong, left = summary["asked"], summary["wrong"], summary["left"]
     silent = {code.lower(): _cases(summary, code) for code in SILENT}
@@ -382,7 +382,7 @@ def _evidence(view: View) -> Iterator[str]:
 
 
 def _failures(summary: Mapping[str, Any]) -> Iterator[Finding]:
-    """Yield one finding per failure code, with the code of another failure that may be its cause."""
+    """Yield one finding per failure code. It names another failure that may be the cause."""
     by_code: dict[str, list[Mapping[str, Any]]] = {}
     for row in summary["failures"]:
         by_code.setdefault(row["code"], []).append(row)
@@ -414,7 +414,7 @@ def _failures(summary: Mapping[str, Any]) -> Iterator[Finding]:
 
 
 def _conduct(summary: Mapping[str, Any], answered: int) -> Iterator[Finding]:
-    """Yield findings on properties of the neighbor list that are not errors, such as single precision."""
+    """Yield findings on properties that are not errors, such as single precision."""
     ties = summary["ties"]
     if ties["counted"] and ties["not_counted"]:
         yield TEXTS.finding("TIES", **ties)
@@ -448,7 +448,7 @@ def _conduct(summary: Mapping[str, Any], answered: int) -> Iterator[Finding]:
 
 
 def page(view: View, verdict: Verdict) -> Page:
-    """Return the report page of an examination: results by subject, failures, and the list's conventions."""
+    """Return the report page of an examination."""
     summary = view.summary
     wrong, kinds = summary["wrong"] - summary["silent"], len(summary["failures"])
     totals = {name: _total(summary, name) for name in ("passed", "skipped")}
@@ -481,7 +481,7 @@ def page(view: View, verdict: Verdict) -> Page:
 
 
 def _tables(summary: Mapping[str, Any]) -> Iterator[Table]:
-    """Yield two tables of results by subject: for lists built once, and for lists updated during a run."""
+    """Yield two tables of results: for lists built once, and for lists updated during a run."""
     columns: dict[str, Any] = {
         "area": "area", "tested": "asked", "right": "passed",
         "wrong": lambda row: row["failed"] - row["silent"] or None,

@@ -1,7 +1,7 @@
-"""`mdnum ball --demo`: short demonstrations of numerical effects, each with claims that are tested.
+"""`mdnum ball --demo`: short demonstrations of numerical effects, with tested claims.
 
-A demonstration is a script `NN_its_name.py` in the folder `demos` next to the shipped systems. The first line
-of the script states the subject; the function `run()` of the script returns a `Demo`.
+A demonstration is a script `NN_its_name.py` in the folder `demos`. Its first line states the subject. Its
+function `run()` returns a `Demo`.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ _LISTED = 16
 
 @dataclass(frozen=True)
 class Claim:
-    """A claim of a demonstration, with expected value, observed value, and result of the test."""
+    """A claim of a demonstration, with expected and observed value."""
 
     what: str  # the statement, in words
     seen: Any  # the number or word that was found
@@ -120,7 +120,7 @@ def names() -> list[str]:
 
 
 def about(name: str) -> str:
-    """Return the first line of a demonstration's file without importing the file (which imports jax)."""
+    """Return the first line of a demonstration's file without importing the file."""
     text = ast.get_docstring(ast.parse(_files()[_known(name)].read_text(encoding="utf-8")))
     return (text or "").partition("\n")[0].rstrip(".")
 
@@ -156,7 +156,7 @@ def _known(name: str) -> str:
 
 
 def _document(name: str, demo: Demo) -> dict[str, Any]:
-    """Return a demonstration as plain values; the points of its plots are in a separate table."""
+    """Return a demonstration as plain values. The points of its plots are in a separate table."""
     document = {"name": name, "ok": demo.ok, **plain(demo)}
     for table in document["tables"]:
         del table["shown"], table["bad"]
@@ -211,7 +211,7 @@ def judge(view: View) -> Verdict:
 
 
 def page(view: View, verdict: Verdict) -> Page:
-    """Return the report page of one or several demonstrations: results, figures, numbers and checks."""
+    """Return the report page of one or several demonstrations."""
     demos, curves = _demos(view), view.table("curves")
     sections: list[Section] = []
     for demo in demos:
@@ -250,7 +250,7 @@ def _result(demo: Mapping[str, Any]) -> str:
 
 
 def _table(stored: Mapping[str, Any]) -> Table:
-    """Format a table with the fewest digits (at least five) that distinguish the numbers in each column."""
+    """Format a table with the fewest digits that distinguish the numbers in each column (at least five)."""
     columns = []
     for values in zip(*stored["rows"], strict=True):
         digits = _digits(values, 10)
@@ -268,7 +268,7 @@ def _digits(values: Iterable[Any], least: int) -> int:
 
 
 def shown(value: Any, digits: int = 10) -> str:
-    """Format a plain value as text: numbers with at most `digits` significant digits, lists in brackets."""
+    """Format a plain value as text. Numbers have at most `digits` significant digits."""
     if isinstance(value, Mapping):
         return ", ".join(f"{str(key).replace('_', ' ')} {shown(item, digits)}" for key, item in value.items())
     if isinstance(value, list):

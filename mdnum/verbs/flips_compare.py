@@ -1,4 +1,4 @@
-"""`mdnum flips A B`: comparison of neighbor sets in two trajectories of the same atoms, frame by frame."""
+"""`mdnum flips A B`: compare the neighbor sets of two trajectories."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ def compare(
     between: tuple[str, str] | None,
     **keep: Unpack[Keep],
 ) -> Outcome:
-    """Find the frame at which two trajectories of the same atoms diverge; see `mdnum.verbs.flips.flips`.
+    """Find the frame at which two trajectories diverge; see `mdnum.verbs.flips.flips`.
 
     Raises:
         InputError: the trajectories do not contain the same atoms.
@@ -102,7 +102,7 @@ def compare(
 
 
 def _alike(a: Trajectory, b: Trajectory) -> bool:
-    """True if two files may contain the same atoms, judged by the species that the files contain."""
+    """True if two files may contain the same atoms, judged by the species."""
     first, second = ([str(one) for one in file.species] for file in (a, b))
     if not (a.table.named and b.table.named) or first == second:
         return True
@@ -116,7 +116,7 @@ def _alike(a: Trajectory, b: Trajectory) -> bool:
 
 
 class ComparisonView(FlipsView):
-    """Results of a comparison of two trajectories, read from its folder and formatted for sentences."""
+    """Results of a comparison of two trajectories, read from its folder."""
 
     @property
     def certain(self) -> bool:
@@ -126,18 +126,18 @@ class ComparisonView(FlipsView):
 
     @property
     def differ(self) -> bool:
-        """True if neighbor sets differ, and the trajectories differ by more than the files' resolution."""
+        """True if neighbor sets differ, and positions differ by more than the files' resolution."""
         return self.certain and any(one["first"] is not None for one in self.summary["rules"])
 
     @property
     def largest(self) -> tuple[str, str]:
-        """Largest distance between an atom's positions in both files, and how much rounding can explain."""
+        """Largest distance between an atom's positions in both files, and how much rounding explains."""
         table = self.table("apart")
         at = int(np.argmax(table["furthest"]))
         return self.length(float(table["furthest"][at])), self.length(float(table["bound"][at]))
 
     def frame(self, at: int | None) -> str:
-        """Format the index of a frame, with its numbers in the two files if these differ from the index."""
+        """Format the index of a frame. Its numbers in the two files are added if they differ."""
         if at is None:
             return "no frame"
         a, b = (int(self.table("apart")[f"number_{one}"][at]) for one in "ab")
@@ -149,7 +149,7 @@ class ComparisonView(FlipsView):
 
     @property
     def shift(self) -> dict[str, Any]:
-        """Displacement common to all atoms: a vector at one frame, and its range of lengths over frames."""
+        """Displacement common to all atoms at one frame, and its range of lengths over frames."""
         table, at = self.table("apart"), self.summary["shift"]
         vectors = np.stack([table[f"shift_{one}"] for one in "xyz"], axis=1)
         sizes = np.sqrt((vectors**2).sum(axis=1))
@@ -162,7 +162,7 @@ class ComparisonView(FlipsView):
         }  # fmt: skip
 
     def by_boxes(self, first: Mapping[str, Any]) -> bool:
-        """True if boxes, but not positions, differ at the first frame at which the neighbor sets differ."""
+        """True if only boxes differ when the neighbor sets first differ."""
         boxes, beyond = self.summary["other_box"], self.summary["beyond"]
         same = beyond is None or beyond > first["frame"]
         return boxes is not None and boxes["frame"] <= first["frame"] and same
@@ -188,7 +188,7 @@ def judge(view: ComparisonView) -> Verdict:
 
 
 def _headline(view: ComparisonView) -> str:
-    """Return the verdict on the first neighbor rule, and then a sentence on each further rule."""
+    """Return the verdict on the first neighbor rule, and a sentence on each further rule."""
     first, *others = view.summary["rules"]
     text = TEXTS(f"head_{_head(view, first)}", **view.values(first))
     if view.summary["shift"] is not None:
@@ -220,7 +220,7 @@ def _in_short(view: ComparisonView, one: Mapping[str, Any]) -> str:
 
 
 def _evidence(view: ComparisonView) -> Iterator[str]:
-    """Yield sentences on differences in positions and in neighbor sets, and on which of them came first."""
+    """Yield sentences on differences in positions and in neighbor sets, and which came first."""
     summary, (one, *others) = view.summary, view.summary["rules"]
     seed, beyond, first, values = summary["seed"], summary["beyond"], one["first"], view.values(one)
     if seed is not None:
@@ -248,7 +248,7 @@ def _evidence(view: ComparisonView) -> Iterator[str]:
 
 
 def _certain(one: Mapping[str, Any]) -> str:
-    """Tell when neighbor sets differ by more than rounding: at their first difference, later, or never."""
+    """Tell when neighbor sets differ by more than rounding."""
     if one["first"]["pairs"] > one["first"]["ambiguous"]:
         return "some"
     return "never" if one["certain"] is None else "later"
@@ -269,7 +269,7 @@ def _order(view: ComparisonView, one: Mapping[str, Any]) -> str:
 
 
 def _leap(view: ComparisonView, first: Mapping[str, Any]) -> Iterator[str]:
-    """Yield a sentence on whether trajectories diverge faster after their neighbor sets begin to differ."""
+    """Yield a sentence on whether trajectories diverge faster once their neighbor sets differ."""
     table, at = view.table("apart"), int(first["frame"])
     furthest = table["furthest"]
     # a difference that has just begun grows fast, whatever began it
@@ -396,7 +396,7 @@ def _first_pairs(view: ComparisonView) -> Iterator[Table]:
 def _plot(
     view: ComparisonView, name: str, lines: Mapping[str, tuple[np.ndarray, Any]], unit: str = ""
 ) -> Plot:
-    """Return a figure of quantities versus time or frame number; reference lines are dashed."""
+    """Return a figure of quantities versus time or frame number."""
     table, summary = view.table("apart"), view.summary
     timed = summary["timed"] and bool(np.all(np.diff(table["time"]) > 0))
     x = table["time"] if timed else table["frame"]

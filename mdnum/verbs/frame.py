@@ -1,13 +1,13 @@
-"""Functions common to all verbs (commands), which make, fill, judge and show an output folder.
+"""Functions common to all verbs (the commands of mdnum).
 
-The module of a verb contains three functions: the verb (options → output folder), `judge` (view of the folder
-→ findings and a headline) and `page` (view of the folder → sections). The sentences of findings and pages are
-in a text file named after the module. A module declares its verb in one line:
+The module of a verb contains three functions. The verb fills an output folder. `judge` returns the folder's
+findings and a headline, `page` the sections of its page. The sentences are in a text file named after the
+module. A module declares its verb in one line:
 
     KINDS = {"flips": Verb(judge, page)}
 
-The key "flips" is the kind of output folder, which the text file declares under [kinds.flips]. The functions
-`judge` and `page` read only the folder, so a page can be written again later.
+"flips" is the kind of output folder, declared in the text file under [kinds.flips]. `judge` and `page` read
+only the folder. A page can thus be written again later.
 """
 
 from __future__ import annotations
@@ -60,7 +60,7 @@ STEPWISE = 50
 
 @dataclass(frozen=True)
 class View:
-    """Read access to an output folder, from which findings and sections of a page are made."""
+    """Read access to an output folder, for findings and pages."""
 
     folder: RunFolder  # on disk
     summary: dict[str, Any]  # as written, without what was judged
@@ -74,7 +74,7 @@ class View:
 
     @cached_property
     def system(self) -> Mapping[str, Any]:
-        """Tables in the system file of the run; empty if the folder contains no system."""
+        """Tables in the system file of the run. They are empty if there is no system."""
         return self.folder.system
 
     @cached_property
@@ -94,12 +94,12 @@ class View:
         return self._tables[name]
 
     def kept(self, codes: Mapping[str, Any]) -> list[Finding]:
-        """Return the stored findings of other modules, which are those whose codes are not in `codes`."""
+        """Return the stored findings whose codes are not in `codes`."""
         found = self.summary.get("findings") or ()
         return [restore(each) for each in found if each.get("code") not in codes]
 
     def page(self, title: str, about: str, keys: Iterable[Key], sections: Iterable[Section]) -> Page:
-        """Return the report page of the folder, with system and provenance; empty sections are omitted."""
+        """Return the report page of the folder. Empty sections are omitted."""
         kept = [section for section in sections if section.parts]
         file = self.folder.system_file
         what = ("", "") if file is None else (file.name, read_text(file))
@@ -128,7 +128,7 @@ class Interrupted(KeyboardInterrupt):
 def asked_to_stop() -> Iterator[Callable[[], bool]]:
     """Yield a function that returns True after control-C; a second control-C raises KeyboardInterrupt.
 
-    Python delivers signals only to the main thread; in other threads, the function always returns False.
+    Python delivers signals only to the main thread. In other threads, the function returns False.
     """
     asked = threading.Event()
     if threading.current_thread() is not threading.main_thread():
@@ -148,7 +148,7 @@ def asked_to_stop() -> Iterator[Callable[[], bool]]:
 
 
 def end_on_sigterm(stack: ExitStack) -> None:
-    """Treat SIGTERM like control-C until `stack` is closed (main thread only), so that results are stored."""
+    """Treat SIGTERM like control-C until `stack` is closed, so that results are stored. Main thread only."""
     if threading.current_thread() is threading.main_thread():
         before = signal.signal(signal.SIGTERM, signal.default_int_handler)
         stack.callback(signal.signal, signal.SIGTERM, before)
@@ -170,14 +170,14 @@ class Keep(TypedDict, total=False):
 
 
 class UnknownKeyword(InputError, TypeError):
-    """Raised if a public function gets an unknown keyword argument; a subclass of TypeError."""
+    """Raised if a public function gets an unknown keyword argument."""
 
 
 def keywords_checked(verb: V, more: Iterable[str] = (), name: str = "") -> V:
-    """Wrap a public function to reject unknown keyword arguments before any file is read or written.
+    """Make a public function reject unknown keyword arguments before it reads or writes files.
 
-    If keywords were not checked first, a misspelled keyword in `**keep` would raise an error only when the
-    output folder is made. Until then, the function would use the default value of the misspelled option.
+    Otherwise a misspelled keyword in `**keep` would raise an error only when the output folder is made. Until
+    then, the function would use the default value of the misspelled option.
 
     Args:
         more: names of keywords that the verb passes on in addition to those of `Keep`.
@@ -215,10 +215,10 @@ def keywords_checked(verb: V, more: Iterable[str] = (), name: str = "") -> V:
 
 
 def content(verb: str, asked: Mapping[str, Any]) -> str:
-    """Return a digest of the arguments of a verb, 16 hexadecimal digits that are the same in every process.
+    """Return a digest of the arguments of a verb: 16 hexadecimal digits, the same in every process.
 
-    The digest covers the content of a system (not its file name), the bytes of a file, the manifest of a run
-    folder, the values of other arguments, and the version of mdnum.
+    The digest covers the content of a system, the bytes of a file, the manifest of a run folder, and the
+    values of other arguments. It also covers the version of mdnum.
 
     Raises:
         InputError: an argument has no plain value, such as a function.
@@ -252,7 +252,7 @@ def content(verb: str, asked: Mapping[str, Any]) -> str:
 
 @dataclass
 class Answer:
-    """Output folder while it is being filled: the summary, tables and result to be stored."""
+    """Output folder while it is being filled."""
 
     folder: RunFolder  # that is filled
     log: Progress  # passes progress on and writes it to log.txt
@@ -274,7 +274,7 @@ def answering(
     progress: Progress | None = None,
     allow_code: bool = False,
 ) -> Iterator[Answer]:
-    """Context manager for a new output folder; on exit, the results are stored, judged and shown.
+    """Context manager for a new output folder. On exit, the results are stored, judged and shown.
 
     Args:
         kind, name, system: as for `new_folder`.
@@ -295,7 +295,7 @@ def answering(
 
 
 def layout(kind: str) -> Layout:
-    """Return the layout (tables and columns) of a kind of folder, from the text file of its verb.
+    """Return the tables and columns of a kind of folder, from its verb's text file.
 
     Raises:
         InputError: no installed verb declares the kind.
@@ -310,7 +310,7 @@ def layout(kind: str) -> Layout:
 def new_folder(
     kind: str, name: str, out: str | Path | None = None, *, system: Any = None
 ) -> Iterator[RunFolder]:
-    """Context manager for a new output folder that contains the system and its provenance.
+    """Context manager for a new output folder with the system and its provenance.
 
     Args:
         kind: kind of the folder, which a verb declares.
@@ -343,7 +343,7 @@ def finish(
     view: View | None = None,
     write: bool = True,
 ) -> Outcome:
-    """Judge a folder: add findings and verdict to its summary.json, and write its report page if requested.
+    """Judge a folder. Add the findings to its summary.json, and write its report page.
 
     Args:
         result: result of the verb's computation, for a caller in Python.
@@ -386,7 +386,7 @@ def finish(
 
 
 def read(folder: str | Path) -> Outcome:
-    """Return the outcome stored in an output folder; judge the results again, but write nothing.
+    """Return the outcome stored in an output folder. Judge the results again, but write nothing.
 
     Example:
         >>> mdnum.read("runs/argon-crystal-108-1").table("flips")
@@ -398,7 +398,7 @@ def read(folder: str | Path) -> Outcome:
 
 
 def say(progress: Progress | None, phase: str, step: int = 0, steps: int = 0, **counts: Any) -> None:
-    """Call the progress function, if one was given, with the phase and the current step."""
+    """Call the progress function, if there is one."""
     if progress is not None:
         progress(step, steps, {"phase": phase, **counts})
 
@@ -421,7 +421,7 @@ def store(folder: RunFolder, summary: Mapping[str, Any], tables: Mapping[str, An
 
 
 def words(texts: Sequence[str] | str) -> tuple[str, ...]:
-    """Return the distinct words of a text, or of several texts, separated by commas."""
+    """Return the distinct words of one or several texts, separated by commas."""
     texts = (texts,) if isinstance(texts, str) else texts
     return tuple(dict.fromkeys(word.strip() for text in texts for word in text.split(",") if word.strip()))
 
@@ -443,7 +443,7 @@ def refuse(given: Mapping[str, bool], whose: str, remedy: str) -> None:
 
 
 def logged(folder: RunFolder, progress: Progress | None, lines: int = 10) -> Progress:
-    """Wrap a progress function to log each new phase, and progress at intervals, in log.txt.
+    """Return a progress function that also writes to log.txt.
 
     Args:
         lines: approximate number of lines for a phase that counts its steps.

@@ -50,7 +50,7 @@ def copy(system: str, target: Path | None = None) -> Reply:
 
 
 def _size_in(file: Path) -> dict[str, Any]:
-    """Read the number of atoms or balls and the description from a shipped system file, without checks.
+    """Read the number of atoms or balls and the description from a shipped system file.
 
     Building all systems would require importing jax and ASE, which takes seconds.
     """

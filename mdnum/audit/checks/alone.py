@@ -36,7 +36,7 @@ class AloneCheck(AuditCheck):
     needed_to = ("run",)
 
     def ask(self, subject: CalculatorSubject, progress: Progress) -> CheckResult:
-        """Evaluate energy and force of single atoms, and of an atom far away from a cluster."""
+        """Evaluate single atoms, and an atom far away from a cluster."""
         with subject.meter.limited():
             self.look(subject, *settled(subject.fresh(), np.random.default_rng(self.seed)))
         found = list(self.findings())
@@ -54,7 +54,7 @@ class AloneCheck(AuditCheck):
         )
 
     def look(self, subject: CalculatorSubject, atoms: Atoms, noise: NoiseFloor) -> None:
-        """Evaluate atoms and fragments of a structure, or whole molecules, with new calculator objects."""
+        """Evaluate parts of a structure, or whole molecules, with new calculator objects."""
         self.rows: list[dict[str, Any]] = []
         self.floor = noise.allowed
         self.refused: list[tuple[str, CalculatorError]] = []
@@ -63,7 +63,7 @@ class AloneCheck(AuditCheck):
         def energy(
             what: str, there: Atoms, expected: float | None = None, lone: slice = slice(None), size: int = 1
         ) -> float | None:
-            """Record the energy of a structure, and the net force on each isolated group of `size` atoms."""
+            """Record the energy of a structure, and the net force on each isolated group."""
             answer = subject.fresh().try_both(there)
             if isinstance(answer, CalculatorError):
                 self.refused.append((what, answer))

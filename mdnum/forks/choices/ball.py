@@ -1,4 +1,4 @@
-"""Choices for a ball only: the stopping rule of its iterative solver, and single inverted decisions."""
+"""Numerical choices for a ball only: the stopping rule, and single inverted decisions."""
 
 from __future__ import annotations
 
@@ -87,7 +87,7 @@ def _check_place(system: BallSystem, step: int | None, ball: int | None) -> None
 
 @choice("contact")
 class ContactStep(Choice):
-    """One contact decision of one ball inverted; all other decisions are made as usual."""
+    """One contact decision of one ball inverted."""
 
     worlds = ("ball",)
     screened = "contact=earlier contact=later"

@@ -1,9 +1,9 @@
 """Run a simulation in exact real arithmetic. Every decision is proven by interval arithmetic (library Arb).
 
-The initial state and all constants are the double-precision numbers of the simulation, treated as exact.
+The double-precision numbers of the simulation count as exact: the initial state and all constants.
 Positions and velocities are represented by intervals ("balls") in multiple-precision arithmetic. A decision
-is proven if the interval of the squared distance excludes the squared cutoff; otherwise the run is repeated
-with more bits. The exact run makes the decisions that the program would make without any rounding.
+is proven if the interval of r² excludes the squared cutoff. Otherwise the run is repeated with more bits. The
+exact run makes the decisions of the program without rounding.
 
 Source: Johansson, Arb, IEEE Transactions on Computers 66 (2017) 1281.
 """
@@ -49,10 +49,10 @@ _U = 2.0**-53
 def pull_of(
     potential: PairPotential, constants: Mapping[str, float], cutoff: str, r_cut: float, r_onset: float
 ) -> Callable[[Any], Any]:
-    """Return a function of an interval of r² that computes 2 du/d(r²) for a pair inside the cutoff.
+    """Return a function that computes 2 du/d(r²) of a pair from an interval of r².
 
-    The factor 2 du/d(r²) multiplies the displacement x_j - x_i in the force on i. Constants are exact
-    doubles. Values derived from constants are intervals in the current precision of Arb.
+    The force on i is 2 du/d(r²) times x_j - x_i. Constants are exact doubles. Values derived from constants
+    are intervals in the current precision of Arb.
 
     Raises:
         TypeError: the potential uses an operation that ball arithmetic does not support.
@@ -67,7 +67,7 @@ def pull_of(
 
 
 def _lennard_jones(sigma: Any, epsilon: Any) -> tuple[Callable[[Any], Any], Callable[[Any], Any]]:
-    """Return functions that compute 2 du/d(r²) and u of the Lennard-Jones potential in few operations."""
+    """Return functions for 2 du/d(r²) and u of the Lennard-Jones potential."""
     s2 = sigma * sigma
     s6 = s2 * s2 * s2
     # u = (4 epsilon s6) r⁻⁶ (s6 r⁻⁶ - 1), 2 du/d(r²) = (attract - repel r⁻⁶) r⁻⁸
@@ -90,7 +90,7 @@ def _lennard_jones(sigma: Any, epsilon: Any) -> tuple[Callable[[Any], Any], Call
 def _enclosed(
     potential: PairPotential, **constants: Any
 ) -> tuple[Callable[[Any], Any], Callable[[Any], Any]]:
-    """Return functions that compute 2 du/d(r²) and u of any potential, one operation at a time."""
+    """Return functions for 2 du/d(r²) and u of any potential."""
 
     def evaluate(r2, *values):
         leaves = {name: value[None] for name, value in zip(constants, values, strict=True)}
@@ -120,7 +120,7 @@ class ExactHistory:
 
     @property
     def bits_per_step(self) -> float:
-        """Growth of interval widths in the second half of a run, in bits per step; NaN for short runs."""
+        """Growth of interval widths in the second half of a run, in bits per step. NaN for short runs."""
         rows = np.flatnonzero(np.isfinite(self.radius))
         if len(rows) < 4:
             return float("nan")
@@ -136,7 +136,7 @@ def installed() -> bool:
 
 
 def unsupported(simulation: Simulation) -> InputError | None:
-    """If the system cannot be certified, return an error that states a remedy; otherwise None."""
+    """Return an error that states a remedy if the system cannot be certified."""
     half, atoms = float(np.min(simulation.cell.widths)) / 2, simulation.atoms
     alone = simulation.pairwise and not isinstance(simulation.potential, SumPotential)
     reasons = (
@@ -185,7 +185,7 @@ def unsupported(simulation: Simulation) -> InputError | None:
 
 
 def _without_balls(simulation: Simulation) -> InputError | None:
-    """Return an error if the potential or cutoff uses an operation that ball arithmetic does not support."""
+    """Return an error if ball arithmetic lacks an operation of the potential or cutoff."""
     from flint import arb
 
     try:
@@ -201,7 +201,7 @@ def _without_balls(simulation: Simulation) -> InputError | None:
 
 
 def _pulls(simulation: Simulation) -> list[Callable[[Any], Any]]:
-    """Return, for each pair type, a function that computes 2 du/d(r²) in ball arithmetic."""
+    """Return a function for 2 du/d(r²) in ball arithmetic, for each pair type."""
     model, bare = simulation.model, simulation.model.potential
     radii = zip(np.asarray(model.r_cut), np.asarray(model.r_onset), strict=True)
     return [
@@ -211,7 +211,7 @@ def _pulls(simulation: Simulation) -> list[Callable[[Any], Any]]:
 
 
 class ExactProgram:
-    """Program that runs a simulation in interval (ball) arithmetic from a double-precision initial state.
+    """Program that runs a simulation in interval (ball) arithmetic.
 
     Args:
         simulation: the simulation; its constants are in double precision, whatever its precision policy.
@@ -249,7 +249,7 @@ class ExactProgram:
         bits: int | None = None,
         progress: Callable[[int, int], None] | None = None,
     ) -> ExactHistory:
-        """Prove every decision up to a step; if an attempt fails, repeat with more bits of precision.
+        """Prove every decision up to a step. Failed attempts are repeated with more bits.
 
         Args:
             steps: last step.
@@ -278,7 +278,7 @@ class ExactProgram:
 
 
 class _Run:
-    """One attempt to prove all decisions of a run with a given number of bits."""
+    """One attempt to prove all decisions of a run with some number of bits."""
 
     def __init__(self, program: ExactProgram, steps: int, bits: int):
         self.program, self.steps, self.bits, self.step = program, steps, bits, 0
@@ -289,7 +289,7 @@ class _Run:
         self._close = 0
 
     def bits_needed(self) -> int:
-        """Estimate how many bits the whole run needs, from the growth of the intervals up to this step."""
+        """Estimate how many bits the run needs, from the growth of the intervals so far."""
         grown = self._radius[: self.step + 1]
         known = np.flatnonzero(np.isfinite(grown))
         if len(known) < 50:
@@ -388,7 +388,7 @@ class _Run:
         return first
 
     def _shift(self, n: list[int]) -> tuple[Any, Any, Any]:
-        """Return n1 a1 + n2 a2 + n3 a3 exactly, for integers n and lattice vectors a."""
+        """Return n1 a1 + n2 a2 + n3 a3 exactly, for lattice vectors a."""
         key = (n[0], n[1], n[2])
         if key not in self._shifts:
             rows = self._lattice
@@ -399,11 +399,10 @@ class _Run:
     def _decide(
         self, x, centers: Float[np.ndarray, "atoms 3"], radius: float, thresholds: list
     ) -> tuple[Bool[np.ndarray, "all_pairs"], Int[np.ndarray, "all_pairs 3"], Float[np.ndarray, "all_pairs"]]:
-        """Make all decisions of a step by double-precision bounds, or by intervals if the bounds do not
-        suffice.
+        """Make all decisions of a step by double-precision bounds, or else by intervals.
 
-        Double precision and exact arithmetic may choose different nearest images. Different nearest images
-        are both outside the cutoff, because half the box exceeds r_cut by more than the rounding errors.
+        Double precision and exact arithmetic may choose different nearest images. Half the box exceeds r_cut
+        by more than the rounding errors. Different nearest images are then both outside the cutoff.
         """
         program = self.program
         i, j, matrix = program._i, program._j, program._matrix
@@ -436,7 +435,7 @@ class _Run:
 
 
 def _log2_radius(ball) -> float:
-    """Return an upper bound on log2 of an interval's radius, even for radii outside the range of doubles."""
+    """Return an upper bound on log2 of an interval's radius. The radius may exceed the range of doubles."""
     if ball.is_exact():
         return -math.inf
     mantissa, exponent = ball.rad().man_exp()

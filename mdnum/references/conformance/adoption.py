@@ -1,4 +1,4 @@
-"""The conformance suite for a library's own tests: a class to subclass, with one test per topic.
+"""The conformance suite for a library's own tests: a class to subclass.
 
     from mdnum.references.conformance import ListLimits, NeighborListConformance
     from mylibrary import neighbor_list
@@ -7,7 +7,7 @@
         pairs = staticmethod(neighbor_list)
         limits = ListLimits(minimum_image=True)
 
-A failed test prints the error, and a script that reproduces the error with a few atoms.
+A failed test prints the error, and a script that reproduces it with a few atoms.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ from mdnum.references.conformance.suite import Examiner, examine
 
 
 class NeighborListConformance:
-    """Tests of a neighbor list; a subclass sets `pairs` and has a name that pytest collects."""
+    """Tests of a neighbor list. A subclass sets `pairs` and has a name that pytest collects."""
 
     # a function of (positions, cell, pbc, r_cut) in `staticmethod`, a class or an object with `allocate` and
     # `update` (`KeptList`), or a word that `load` knows
@@ -57,7 +57,7 @@ class NeighborListConformance:
 
     @pytest.mark.parametrize("area", AREAS)
     def test_neighbor_list(self, area: str) -> None:
-        """Test that the neighbor list returns the correct pairs in all test cases of one area."""
+        """Test that the neighbor list returns the correct pairs in one area."""
         tested = self.subject()
         cases = self.asked(tested, area)
         if not cases:

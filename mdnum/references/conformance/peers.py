@@ -1,8 +1,8 @@
-"""Neighbor searches of libraries; any neighbor list can be found by name or `module:function`.
+"""Neighbor searches of libraries, found by name or `module:function`.
 
-Every function and class in this module imports what it requires and uses nothing else in the module, because
-its source code is copied into scripts that reproduce a failure without mdnum. Each function calls its library
-as a user would: atoms outside the box, unusual cells and few atoms are passed on unchanged.
+Every function and class here imports what it needs and uses nothing else in the module. Its source is copied
+into scripts that reproduce a failure without mdnum. Each function calls its library as a user would. Unusual
+input is passed on unchanged.
 """
 
 # pyright: reportOptionalMemberAccess=false, reportOptionalCall=false
@@ -34,7 +34,7 @@ def _declared(name: str) -> dict[str, Any]:
 
 
 def peer(*names: str, helpers: Sequence[Any] = ()) -> Callable[[Any], Any]:
-    """Return a decorator that registers a function or a class of neighbor lists in `LISTS` by given names.
+    """Return a decorator that registers a neighbor list in `LISTS` by given names.
 
     Args:
         names: names listed in peers.toml.
@@ -94,7 +94,7 @@ def ase_neighbor_list(positions, cell, pbc, r_cut):
 
 @peer("ase-skin")
 class AseSkinList:
-    """The class ase.neighborlist.NeighborList of ASE, which adds a skin to the radius of each atom."""
+    """The class ase.neighborlist.NeighborList of ASE. It adds a skin to the radius of each atom."""
 
     kept = pbc = None
 
@@ -135,7 +135,7 @@ def ase_primitive_list(positions, cell, pbc, r_cut):
 
 @peer("vesin", "vesin-half")
 def vesin_cells(positions, cell, pbc, r_cut, half=False):
-    """The cell list of vesin, which lists every pair once for each of its two atoms."""
+    """The cell list of vesin. It lists every pair once for each of its two atoms."""
 
     from vesin import NeighborList
 
