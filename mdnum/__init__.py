@@ -1,13 +1,13 @@
-"""Molecular dynamics with a cutoff: pairs that cross the cutoff, runs that diverge, and gradients.
+"""Molecular dynamics with a cutoff: crossings of the cutoff, runs that diverge, and gradients.
 
-A simulation is created from Python objects, or from a system file, as follows:
+Create a simulation from Python objects or from a system file:
 
     >>> argon = mdnum.LennardJones(sigma=3.405, epsilon=0.0103235)
     >>> sim = mdnum.simulation(atoms, argon, mdnum.Cut("switched", 8.5), timestep=0.002)
     >>> sim = mdnum.build("argon/liquid-864")
     >>> sim = mdnum.changed(sim, {"cutoff.radius": 8.0})
 
-A function takes a simulation, or the name or path of a system file, and writes its results to a folder:
+A function takes a simulation or a system file, and writes its results to a folder:
 
     run                 simulate, record every flip, compare with ASE
     fork, fork_...      compare two runs that differ in one choice; maps, certificates, forecasts
@@ -25,8 +25,7 @@ The package provides `Simulation` and its `parameters`, pair potentials (`Lennar
 `Integrator` for new ones), `PrecisionPolicy`, gradients (`Problem`, `value_and_grad`, `method`) and
 `MdnumCalculator` for ASE.
 
-Names of this package are imported on first use (PEP 562), because importing jax takes half a second and
-importing jax_md takes six seconds, and `mdnum --help` does not need these packages.
+Names are imported on first use (PEP 562), because the import of jax and jax_md takes seconds.
 """
 
 from __future__ import annotations

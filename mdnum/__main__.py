@@ -14,8 +14,8 @@ if __name__ == "__main__" and not sys.flags.safe_path and sys.path[:1] == [os.ge
 def main() -> None:
     """Run the command line and exit.
 
-    While packages are imported, and after the results are saved, control-C ends the process immediately. An
-    interrupted import would otherwise fail in unpredictable ways.
+    Control-C ends the process at once during imports and after the results are saved. An interrupted import
+    would otherwise fail in unpredictable ways.
     """
     for number, name in enumerate(("stdin", "stdout", "stderr")):
         if getattr(sys, name) is None:

@@ -1,4 +1,4 @@
-"""Time limit of a command: results that are missing at the deadline are reported as missing."""
+"""Time limit of a command. Missing results are reported."""
 
 from __future__ import annotations
 
@@ -26,8 +26,8 @@ class TimeUp(Exception):
 class Deadline:
     """A deadline, after which a command does not start further work.
 
-    The evidence for a verdict is measured in function calls, because time depends on the machine. A
-    deadline can only reduce the number of function calls; the command then reports the reduced number.
+    The amount of evidence is counted in function calls, since time depends on the machine. A deadline can
+    reduce the number of calls. The command reports the reduced number.
 
     Args:
         minutes: time from now in minutes; None for no limit.
@@ -63,7 +63,7 @@ class Deadline:
 
 @contextmanager
 def interrupting(deadline: Deadline, grace: float = GRACE) -> Iterator[None]:
-    """Raise `TimeUp` in the main thread if the `with` block still runs `grace` seconds after the deadline.
+    """Raise `TimeUp` in the main thread if the `with` block exceeds the deadline by `grace` seconds.
 
     `TimeUp` is raised repeatedly, because code in the block may catch it. Compiled code is not interrupted.
     """
@@ -84,7 +84,7 @@ def interrupting(deadline: Deadline, grace: float = GRACE) -> Iterator[None]:
 def fewest(
     items: Sequence[T], enough: Callable[[list[T]], bool], spent: Callable[[], bool] = lambda: False
 ) -> list[T]:
-    """Return a subset of items that satisfies a condition; the subset is minimal unless time ran out.
+    """Return a subset that satisfies a condition. It is minimal unless time ran out.
 
     Args:
         items: items that are sufficient together.

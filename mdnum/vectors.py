@@ -1,7 +1,7 @@
-"""LLVM instructions for vectors and for bits of integers that numba does not generate.
+"""LLVM instructions that numba does not generate.
 
-numba recompiles a cached function only if the file that contains the function changes. After a change of this
-file, delete the caches of callers (`__pycache__`), which otherwise contain the old instructions.
+numba recompiles a cached function only if its own file changes. After a change of this file, delete the
+caches of callers (`__pycache__`).
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ intrinsic: Any = numba.extending.intrinsic
 
 @intrinsic
 def lowest_bit(typingctx: Any, word: Any) -> Any:
-    """Return the position of the lowest set bit of a nonzero 64-bit unsigned integer."""
+    """Return the position of the lowest set bit of a nonzero uint64."""
 
     def generate(context: Any, builder: Any, signature: Any, args: Any) -> Any:
         return builder.cttz(args[0], ir.Constant(ir.IntType(1), 1))
@@ -42,7 +42,7 @@ def bits_set(typingctx: Any, word: Any) -> Any:
 
 
 class _Vectors:
-    """Generator of LLVM instructions for vectors of fixed width, with elements of one number type."""
+    """Generator of LLVM instructions for vectors of fixed width and type."""
 
     def __init__(self, context: Any, builder: Any, number: Any, width: int):
         self.context, self.builder, self.width = context, builder, width
@@ -79,7 +79,7 @@ class _Vectors:
         return self.spread(self.builder.load(address, align=self.size))
 
     def larger(self, a: Any, b: Any) -> Any:
-        """Return the elementwise maximum of a and b; where either element is NaN, return the element of b."""
+        """Return the elementwise maximum of a and b. If one is NaN, return b."""
         return self.builder.select(self.builder.fcmp_ordered(">", a, b), a, b)
 
     def squares(self, parts: list[Any]) -> Any:
@@ -115,7 +115,7 @@ def moved(typingctx: Any, source: Any, place: Any, shift: Any, out: Any, at: Any
 
 @intrinsic
 def kept(typingctx: Any, mask: Any, place: Any, labels: Any, first: Any, out: Any, at: Any) -> Any:
-    """Append to an array those of eight labels that a mask selects; return the next free position."""
+    """Append the labels that a mask selects. Return the next free position."""
 
     def generate(context: Any, builder: Any, signature: Any, args: Any) -> Any:
         bits, to = (_Vectors(context, builder, one.dtype, EIGHT) for one in (mask, labels))
@@ -172,7 +172,7 @@ def turned(typingctx: Any, rows: Any, place: Any, apart: Any, out: Any, at: Any,
 
 @intrinsic
 def near_box(typingctx: Any, atoms: Any, shift: Any, box: Any, reach: Any, out: Any) -> Any:
-    """Return a bit mask of the shifted atoms near a rectangular box (squared distance <= `reach`).
+    """Return a bit mask of the shifted atoms within a squared distance `reach` of a box.
 
     The shifted coordinates are written to `out`.
     """
@@ -193,7 +193,7 @@ def near_box(typingctx: Any, atoms: Any, shift: Any, box: Any, reach: Any, out: 
 
 @intrinsic
 def near_atom(typingctx: Any, atom: Any, atoms: Any, low: Any, high: Any) -> Any:
-    """Return bit masks of the atoms whose squared distance from one atom is below `low`, and below `high`."""
+    """Return bit masks of atoms by squared distance: below `low`, and below `high`."""
 
     def generate(context: Any, builder: Any, signature: Any, args: Any) -> Any:
         atom, atoms, low, high = args

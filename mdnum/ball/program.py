@@ -24,7 +24,7 @@ from mdnum.program import Decision, DecisionHistory, Differing, Number, PairRows
 
 @dataclass(frozen=True)
 class ImposedDecision:
-    """A single decision that is imposed on a run; all other decisions are made by the run itself."""
+    """A single decision that is imposed on a run."""
 
     channel: Literal["contact", "stop"]
     step: int  # from 1
@@ -34,7 +34,7 @@ class ImposedDecision:
 
 @dataclass(frozen=True)
 class BallProgram:
-    """A bouncing-ball run (model, initial state and steps), and methods to compare two runs."""
+    """A bouncing-ball run: model, initial state and steps."""
 
     problem: BallProblem  # the program
     # its balls are those of the other program in this order; None where they are the same
@@ -59,7 +59,7 @@ class BallProgram:
 
     @property
     def scale(self) -> float:
-        """Largest initial height (m), or the largest height in the run if all balls start on the floor."""
+        """Largest initial height (m). Largest height in the run if all balls start on the floor."""
         start = self.problem.world.start(self.problem.y0, self.problem.v0)
         height = float(np.abs(np.asarray(start.y, np.float64)).max())
         if height:
@@ -74,16 +74,16 @@ class BallProgram:
 
     @property
     def streams(self) -> bool:
-        """Whether runs can be continued: always False, because the number of steps of a run is fixed."""
+        """Whether runs can be continued. Always False: the number of steps is fixed."""
         return False
 
     @property
     def imposable(self) -> None:
-        """Reason why decisions cannot be imposed: always None, because every decision can be imposed."""
+        """Reason why decisions cannot be imposed. Always None: every decision can be imposed."""
         return None
 
     def check(self, other: BallProgram) -> None:
-        """Raise an error if two programs have different kinds of decisions or numbers of balls.
+        """Raise an error if two programs cannot be compared.
 
         Raises:
             InputError: the kinds of decisions or the numbers of balls differ.
@@ -101,7 +101,7 @@ class BallProgram:
             )
 
     def run(self, steps: int, decisions: BallDecisions | None = None) -> BallRun:
-        """Run the simulation; return the balls in the same order as in the other run of the comparison.
+        """Run the simulation. The balls are in the order of the other run.
 
         Args:
             decisions: decisions imposed on the balls in that order; None for the program's own decisions and
@@ -125,7 +125,7 @@ class BallProgram:
         return run
 
     def _pinned(self, steps: int) -> BallDecisions | None:
-        """Return imposed decisions as arrays (-1 for decisions not imposed), or None if none is imposed."""
+        """Return imposed decisions as arrays (-1: not imposed). None if none is imposed."""
         if not self.pins:
             return None
         world = self.problem.world
@@ -179,7 +179,7 @@ class BallProgram:
     def repeats(
         self, others: Sequence[BallProgram], last: int, tolerance: float, guard: float
     ) -> list[tuple[Float[np.ndarray, "steps"], Float[np.ndarray, "steps"]]]:
-        """Compute the distance of each perturbed run from this run at every step (see `Program.repeats`)."""
+        """Compute the distance of each perturbed run from this run (see `Program.repeats`)."""
         # of the number of steps that was run before: another one would be another compiled program
         steps = min((known for known in self._runs if known >= last), default=last)
         a = self.run(steps)
@@ -191,7 +191,7 @@ class BallProgram:
         return found
 
     def nudged(self, size: float, count: int, seed: int) -> list[BallProgram]:
-        """Return programs whose initial heights are changed at random by at most max(`size`, `ulp`)."""
+        """Return programs with random changes of the initial heights, at most max(`size`, `ulp`)."""
         rng = np.random.default_rng(seed)
         y = np.asarray(np.atleast_1d(self.problem.y0), np.float64)
         size = max(size, self.ulp)
@@ -199,7 +199,7 @@ class BallProgram:
         return [replace(self, problem=replace(self.problem, y0=y0)) for y0 in moved]
 
     def decision(self, other: BallProgram, flips: Sequence[CrossDecision], separation: float) -> Decision:
-        """Return the first differing decision of two runs; at equal steps, contacts precede solver stops."""
+        """Return the first differing decision of two runs. At equal steps, contacts precede stops."""
         first = flips[0]
         return Decision(
             channel=first.channel,
@@ -216,7 +216,7 @@ class BallProgram:
         )
 
     def number(self, key: str) -> Number:
-        """Find a parameter by its full key in the system file, the last word of the key, or its model name.
+        """Find a parameter by its full key, the last word of the key, or its model name.
 
         Raises:
             InputError: the parameter does not exist.
@@ -246,7 +246,7 @@ class BallProgram:
         )
 
     def history(self, steps: int, loss: Callable[..., float] | None = None) -> DecisionHistory:
-        """Return all decisions of a run and the loss of the problem (see `Program.history`)."""
+        """Return all decisions and the loss of a run (see `Program.history`)."""
         problem = replace(self.problem, steps=steps)
         run = problem.run(keep=False)
         contact, counts = run.contact, run.iterations.reshape(steps, -1)
@@ -261,7 +261,7 @@ class BallProgram:
         return DecisionHistory(every, digest, x, value, float("nan"), "", first=1)
 
     def differing(self, other: BallProgram, steps: int, step: int, key: str) -> Differing:
-        """Return the first differing decision of two runs at a step, and the loss gradients of both runs."""
+        """Return the first differing decision at a step, and the loss gradients of both runs."""
         problems = [replace(one.problem, steps=steps) for one in (self, other)]
         runs = [problem.run(history=True) for problem in problems]
         flips = [flip for flip in cross_decisions(runs[0], runs[1], step) if flip.step == step]
@@ -281,7 +281,7 @@ class BallProgram:
 
 
 def _stop_margin(run: BallRun, row: int, iteration: int, margin: float) -> float:
-    """Return the margin of a stop decision: the threshold minus the residual of the solver's iteration."""
+    """Return the margin of a stop decision: threshold minus residual."""
     if run.history is None or not isinstance(run.world.contact, Projection):
         return margin
     rule = run.world.contact.stop
@@ -290,7 +290,7 @@ def _stop_margin(run: BallRun, row: int, iteration: int, margin: float) -> float
 
 
 def _reordered(run: BallRun, order: Int[np.ndarray, "balls"]) -> BallRun:
-    """Return a run with its balls in the same order as in the other run of the comparison."""
+    """Return a run with its balls in the order of the other run."""
     place = np.argsort(order)
     columns = ("y", "v", "height", "contact", "iterations", "reason", "residual", "margin", "before")
     arrays = {name: getattr(run, name) for name in columns}
@@ -311,7 +311,7 @@ def _reordered(run: BallRun, order: Int[np.ndarray, "balls"]) -> BallRun:
 
 
 def _apart(one: BallRun, other: BallRun, last: int) -> Float[np.ndarray, "times"]:
-    """Return two runs' largest height difference at each step, m; infinite if a height is not finite."""
+    """Return the largest height difference of two runs at each step, m. Infinite without finite heights."""
     y = [run.y[: last + 1].astype(np.float64) for run in (one, other)]
     with np.errstate(invalid="ignore"):
         off = np.abs(y[0] - y[1])
@@ -319,7 +319,7 @@ def _apart(one: BallRun, other: BallRun, last: int) -> Float[np.ndarray, "times"
 
 
 def _ends(a: BallRun, b: BallRun) -> tuple[int, dict[str, str]]:
-    """Return the last step at which heights and velocities of two runs are finite, and how each run ends."""
+    """Return the last step with finite states, and how each run ends."""
     ends = {}
     for name, run in (("A", a), ("B", b)):
         finite = np.isfinite(run.y.astype(np.float64)) & np.isfinite(run.v.astype(np.float64))
@@ -333,7 +333,7 @@ def _ends(a: BallRun, b: BallRun) -> tuple[int, dict[str, str]]:
 
 
 def _guarded(separation: np.ndarray, furthest: np.ndarray, guard: float | None) -> np.ndarray:
-    """Set distances between two runs to NaN after a contact was imposed on a ball far from the floor."""
+    """Set distances to NaN after a contact was imposed on a ball far from the floor."""
     beyond = furthest > (np.inf if guard is None else guard)
     if beyond.any():
         separation[int(beyond.argmax()) + 1 :] = np.nan

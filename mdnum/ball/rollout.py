@@ -1,4 +1,4 @@
-"""Simulation of bouncing balls: the compiled time-stepping loop, records of runs, comparison of two runs."""
+"""Simulation of bouncing balls, records of runs, and comparison of two runs."""
 
 from __future__ import annotations
 
@@ -77,7 +77,7 @@ class BallRun:
 
     @cached_property
     def first_contact(self) -> Int[np.ndarray, "balls"]:
-        """Step (from 1) at which each ball first touches the floor, or -1 if the ball never does."""
+        """Step (from 1) at which each ball first touches the floor. -1 if it never does."""
         touched = self.contact.any(axis=0)
         return np.where(touched, self.contact.argmax(axis=0) + 1, -1)
 
@@ -97,9 +97,9 @@ class BallRun:
 
 
 def energy(world: World, y: np.ndarray, v: np.ndarray) -> Float[np.ndarray, "..."]:
-    """Compute the mechanical energy per mass, (m/s)²: the sum of kinetic, gravitational and spring energy.
+    """Compute kinetic, gravitational and spring energy per mass, (m/s)².
 
-    Error: the energy is computed in float64, and a softplus contact is treated as a linear spring.
+    Error: the energy is computed in float64. A softplus contact counts as a linear spring.
     """
     y, v = np.asarray(y, np.float64), np.asarray(v, np.float64)
     total = float(world.gravity) * y + 0.5 * v * v
@@ -172,7 +172,7 @@ _COUNTS: dict[tuple[Any, int], tuple[int, ...]] = {}
 
 
 def undecided(world: World, start: BallState, steps: int) -> BallDecisions:
-    """Return arrays of decisions in which every value is -1, so that no decision is imposed."""
+    """Return arrays of decisions that impose no decision (-1)."""
     kind = jax.tree.structure(world), len(start.y)
     if kind not in _COUNTS:
         solve = eqx.filter_eval_shape(lambda world, start: world.advance(start)[1].solve, world, start)
@@ -195,7 +195,7 @@ def _chunk(world: World, state: BallState, imposed: Any, length: int, history: b
 
 
 def _flips(world: World, made: int, before, y, v, rows: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
-    """Find all changes of contact decisions in a group of steps, given the state before the group."""
+    """Find all changes of contact decisions in a group of steps."""
     contact = rows["contact"]
 
     def packed(bits: np.ndarray) -> np.ndarray:
@@ -227,9 +227,9 @@ def _flips(world: World, made: int, before, y, v, rows: dict[str, np.ndarray]) -
 def height_bound(
     world: World, y: Float[np.ndarray, "..."], v: Float[np.ndarray, "..."]
 ) -> Float[np.ndarray, "..."]:
-    """Return a bound on the rounding error of the height that a contact decision uses, m.
+    """Return a bound on the rounding error of the height in a contact decision, m.
 
-    The height is computed with four roundings from the previous state; the bound sums all terms' magnitudes.
+    The height is computed with four roundings from the previous state.
 
     Args:
         y, v: height (m) and velocity (m/s) of the previous state.
@@ -240,9 +240,9 @@ def height_bound(
 
 
 def residual_bound(world: World, residual: Any, terms: int) -> Any:
-    """Return a bound on the rounding error of a residual, in the unit of the residual.
+    """Return a bound on the rounding error of a residual, in its unit.
 
-    All terms of a residual have the same sign, so the relative error of the sum is at most Higham's gamma_n.
+    The terms of a residual have one sign, so the relative error is at most Higham's gamma_n.
 
     Args:
         residual: residual that a stop decision compares with its threshold.
@@ -255,7 +255,7 @@ def residual_bound(world: World, residual: Any, terms: int) -> Any:
 
 
 class CrossDecision(NamedTuple):
-    """A contact or stop decision that differs between two runs at the same step."""
+    """A contact or stop decision that differs between two runs."""
 
     step: int  # from 1
     channel: str  # "contact" or "stop"
@@ -273,13 +273,13 @@ class CrossDecision(NamedTuple):
 
     @property
     def run(self) -> str:
-        """Name of the run, A or B, in which the ball touches the floor or the solver stops earlier."""
+        """Name of the run (A or B) with the contact or the earlier stop."""
         return "A" if (self.a > self.b) == (self.channel == "contact") else "B"
 
 
 @dataclass(frozen=True)
 class BallDifference:
-    """Steps at which states and decisions of two runs first differ, and differences of the heights."""
+    """Steps at which two runs first differ, and differences of the heights."""
 
     seed: int | None  # first step whose state bits differ (0: the start itself); None where none do
     fork: int | None  # first step whose decisions differ; None where none do
@@ -296,7 +296,7 @@ class BallDifference:
 
 
 def first_difference(a: BallRun, b: BallRun) -> BallDifference:
-    """Compare two runs, and find the steps at which states and decisions first differ.
+    """Find the steps at which states and decisions of two runs first differ.
 
     Raises:
         InputError: the runs have different lengths or numbers of balls.
@@ -324,7 +324,7 @@ def first_difference(a: BallRun, b: BallRun) -> BallDifference:
 
 
 def cross_decisions(a: BallRun, b: BallRun, last: int | None = None) -> list[CrossDecision]:
-    """List all decisions that differ between two runs, by step; contact decisions precede stop decisions.
+    """List all decisions that differ between two runs, by step. Contacts precede stops.
 
     Args:
         a, b: the two runs; margins and bounds of contacts are NaN if their states were not kept.
@@ -346,7 +346,7 @@ def cross_decisions(a: BallRun, b: BallRun, last: int | None = None) -> list[Cro
 
 
 def _stops(a: BallRun, b: BallRun, rows: int) -> list[CrossDecision]:
-    """List the time steps at which the solvers of two runs took different numbers of iterations."""
+    """List the steps with different numbers of solver iterations."""
     row, ball = np.nonzero(_unequal_counts(a, b, rows))
     if a.iterations.ndim == b.iterations.ndim == 1:
         ball = np.full(len(row), -1)
@@ -382,7 +382,7 @@ def _at(values: np.ndarray, row: np.ndarray, ball: np.ndarray) -> np.ndarray:
 def overridden(
     run: BallRun, last: int | None = None
 ) -> tuple[Int[np.ndarray, "times"], Float[np.ndarray, "times"]]:
-    """Count imposed decisions that differ from those that the run's heights and residuals imply.
+    """Count the imposed decisions that the run would have made differently.
 
     Args:
         run: a run with imposed decisions.
@@ -415,7 +415,7 @@ def overridden(
 
 
 def _unequal_counts(a: BallRun, b: BallRun, rows: int) -> np.ndarray:
-    """Return a mask of the steps, or of steps and balls, at which iteration counts of two runs differ."""
+    """Return a mask of the steps, or steps and balls, with different iteration counts."""
     counts = [run.iterations.reshape(run.steps, -1)[:rows] for run in (a, b)]
     differ = counts[0] != counts[1]
     if _counted(a) != _counted(b):

@@ -1,8 +1,8 @@
-"""Iterative solvers: the loop, the rules that stop the loop, and derivatives of the loop.
+"""Iterative solvers: the loop, its stopping rules, and its derivatives.
 
-A stopping rule computes, from the residual of each ball, the quantity that is compared with a threshold. A
-sum over all balls couples independent balls. The last bits of the sum depend on the order of summation. A
-separate stopping rule for each ball involves no sum over balls.
+A stopping rule compares a quantity, computed from the residual of each ball, with a threshold. A sum over all
+balls couples independent balls. The last bits of the sum depend on the order of summation. A separate
+stopping rule for each ball involves no sum over balls.
 """
 
 from __future__ import annotations
@@ -44,7 +44,7 @@ class Reason(IntEnum):
 
 
 class Solve(NamedTuple):
-    """Record of one call of an iterative solver, with one entry per ball if each ball stops separately."""
+    """Record of one call of an iterative solver. One entry per ball if each ball stops separately."""
 
     iterations: Int[Array, "..."]  # how often it went on
     reason: Int[Array, "..."]  # a `Reason`
@@ -66,7 +66,7 @@ class StopRule(Protocol):
     def measure(
         self, terms: Float[Array, "balls"], accumulate: Any, decision: Any, zero: Int[Array, ""]
     ) -> Float[Array, "..."]:
-        """Compute the residual: sum terms in the dtype `accumulate`, then round to the dtype `decision`."""
+        """Compute the residual: sum in the dtype `accumulate`, then round to `decision`."""
         ...
 
     def threshold(self, first: Float[Array, "..."], iteration: Int[Array, "..."]) -> Float[Array, "..."]:

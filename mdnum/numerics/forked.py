@@ -1,4 +1,4 @@
-"""Detection of forked processes: jax hangs in a fork of a process that has used jax."""
+"""Detection of forked processes, in which jax hangs."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ _forked = False
 
 
 def check_not_forked() -> None:
-    """Raise an error if this process cannot use jax; call this function before the first use of jax.
+    """Raise an error if this process cannot use jax. Call this before the first use of jax.
 
     Raises:
         InputError: this process is a fork of a process that has used jax.

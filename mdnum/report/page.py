@@ -1,4 +1,4 @@
-"""Elements shared by all report pages: template environment, style, figures for wide and narrow screens."""
+"""Elements of all report pages: templates, style, and figures."""
 
 from __future__ import annotations
 
@@ -65,7 +65,7 @@ def write(folder: RunFolder, page: Page, verdict: Verdict) -> Path:
 
 
 def brief(page: Page, verdict: Verdict, path: Path, verb: str) -> str:
-    """Return the verdict, key numbers, findings and first figure of a report page as HTML for notebooks."""
+    """Return a short report page as HTML for notebooks."""
     from mdnum.report import drawing
 
     parts = (part for section in page.sections for part in section.parts)
@@ -86,7 +86,7 @@ _LINKED = (".parquet", ".py", ".json", ".toml", ".extxyz", ".npz", ".traj")
 
 
 def _under_causes(findings: Iterable[Finding]) -> list[tuple[Finding, list[Finding]]]:
-    """Return the findings not caused by another finding, each with the findings that it causes."""
+    """Return the findings without a cause, each with the findings that it causes."""
     findings = list(findings)
     codes = {finding.code for finding in findings}
     below: dict[str, list[Finding]] = {}
@@ -123,7 +123,7 @@ def _render(template: str, **content: Any) -> str:
 
 
 def in_words(table: Mapping[str, Any], units: Mapping[str, str] | None = None) -> str:
-    """Describe a table of a system file in one phrase: its kind, then names and values of other entries."""
+    """Describe a table of a system file: its kind, then names and values of other entries."""
     parts = []
     for key, value in table.items():
         if isinstance(value, Mapping):
@@ -141,7 +141,7 @@ def in_words(table: Mapping[str, Any], units: Mapping[str, str] | None = None) -
 
 
 def flat(value: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, str]]:
-    """Yield (name, text) for each entry of nested tables; plain values of the same table share one text."""
+    """Yield (name, text) for each entry of nested tables. Plain values of a table share one text."""
     for key, item in value.items():
         name = f"{prefix}{key}".replace("_", " ")
         if isinstance(item, Mapping):

@@ -89,7 +89,7 @@ def _as_power(found: re.Match[str]) -> str:
 
 
 def heading(text: str) -> str:
-    """Capitalize a heading, unless its first word is the name of a program or the symbol of a quantity."""
+    """Capitalize a heading, unless it begins with the name of a program or a quantity."""
     first = text.split(" ", 1)[0]
     plain = first == "a" or (len(first) > 1 and first.isalpha() and first.islower())
     return text[:1].upper() + text[1:] if plain else text

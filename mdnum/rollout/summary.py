@@ -1,4 +1,4 @@
-"""Summary of a run: totals, and checks of the energy and of the neighbor lists."""
+"""Summary of a run: totals, and checks of energies and neighbor lists."""
 
 from __future__ import annotations
 
@@ -21,9 +21,9 @@ from mdnum.systems.simulation import Simulation
 
 @dataclass
 class LineFit:
-    """A least-squares line through a stream of points, with memory that does not grow with the points.
+    """A least-squares line through a stream of points, in constant memory.
 
-    The first value is subtracted from all values, so that the sums contain only changes of the value.
+    The first value is subtracted from all values to keep the sums small.
     """
 
     count: int = 0
@@ -46,7 +46,7 @@ class LineFit:
 
     @property
     def slope(self) -> float | None:
-        """Slope dy/dx of the line; None for fewer than 3 points, or if sums of squares under- or overflow."""
+        """Slope dy/dx of the line. None for fewer than 3 points, or if sums under- or overflow."""
         spread = self.count * self.xx - self.x * self.x
         if self.count < 3 or not 1e-280 < spread < np.inf:
             return None
@@ -79,7 +79,7 @@ class RunTally:
     def take(
         self, segment: Segment, rows: dict[str, np.ndarray], ledger: FlipTable, bounds: np.ndarray
     ) -> None:
-        """Add a group of time steps, with flips and rounding bounds, to the totals."""
+        """Add a group of time steps to the totals."""
         self.bound = max(self.bound, float(np.max(bounds)))
         pairs = rows["pairs"]
         if self.step < 0:
@@ -106,7 +106,7 @@ class RunTally:
 
 
 def log_line(simulation: Simulation, segment: Segment, row: int, pairs: int, flips: int) -> str:
-    """Format a line of log.txt for a step, with the numbers of pairs inside the cutoff and of flips."""
+    """Format a line of log.txt, with the numbers of pairs inside the cutoff and of flips."""
     potential, kinetic = segment.rows_of("potential")[row], segment.rows_of("kinetic")[row]
     temperature = 2 * kinetic / (degrees_of_freedom(simulation) * simulation.units.k_B)
     step = segment.first + row
@@ -118,7 +118,7 @@ def log_line(simulation: Simulation, segment: Segment, row: int, pairs: int, fli
 
 
 def summarize(simulation: Simulation, done: Any, steps: int, status: str) -> dict[str, Any]:
-    """Return the entries of summary.json that are computed from the totals of a run."""
+    """Return the entries of summary.json for the totals of a run."""
     tally, health, budget = done.tally, done.health, done.budget
     jumps = energy_jump, force_jump = simulation.jumps()
     pairs = pair_names(simulation.symbols)
@@ -188,7 +188,7 @@ def summarize(simulation: Simulation, done: Any, steps: int, status: str) -> dic
 
 
 def closest_pair(simulation: Simulation, positions: Float[np.ndarray, "atoms 3"]) -> str:
-    """Return a phrase about the closest two atoms, which is appended to the message about a blow-up."""
+    """Return a phrase about the closest two atoms, for the error of a blow-up."""
     if simulation.atoms < 2 or not np.all(np.isfinite(positions)):
         return ""
     wrapped, _ = wrap_positions(simulation.cell, positions)
@@ -208,7 +208,7 @@ def closest_pair(simulation: Simulation, positions: Float[np.ndarray, "atoms 3"]
 
 
 def degrees_of_freedom(simulation: Simulation) -> int:
-    """Return the number of degrees of freedom: 3 N, or 3 N - 3 if the total momentum is conserved."""
+    """Return the number of degrees of freedom: 3 N, or 3 N - 3 with conserved total momentum."""
     return simulation.integrator.freedom(simulation.masses)
 
 
@@ -270,7 +270,7 @@ def series_columns(
 
 
 def _lattice(vectors: Float[np.ndarray, "rows 3 3"]) -> dict[str, np.ndarray]:
-    """Return the lengths of the lattice vectors, and the angles between lattice vectors in degrees."""
+    """Return the lengths of the lattice vectors, and their angles in degrees."""
     lengths = np.linalg.norm(vectors, axis=2)
     pairs = np.array([1, 2, 0]), np.array([2, 0, 1])
     dots, products = (np.prod([one[:, k] for k in pairs], axis=0) for one in (vectors, lengths))
@@ -293,7 +293,7 @@ _NOISES = 20.0
 
 @dataclass
 class EnergyBudget:
-    """Check of the recorded energy jumps against energies computed without the run's neighbor lists."""
+    """Check of the recorded energy jumps against energies without neighbor lists."""
 
     simulation: Simulation  # the system as objects
     start: float | None = None  # hard energy minus reference energy at step 0, or None before it was seen
@@ -334,7 +334,7 @@ class EnergyBudget:
 
     @property
     def tolerance(self) -> float:
-        """Largest allowed energy error: a tenth of the smallest energy jump, or a rounding-error bound."""
+        """Largest allowed energy error: a tenth of the smallest jump, or a rounding bound."""
         if self._reference is not self.simulation:
             jumps = np.abs(self.simulation.jumps()[0])
             return _SHARE_OF_A_JUMP * float(jumps[jumps > 0].min())
@@ -349,7 +349,7 @@ class EnergyBudget:
         return abs(self.residual) <= self.tolerance
 
     def to_dict(self) -> dict:
-        """Return the state of the check as plain values, for storage in a checkpoint."""
+        """Return the state of the check as plain values, for a checkpoint."""
         return {name: getattr(self, name) for name in self._fields}
 
     @classmethod
@@ -406,7 +406,7 @@ class ListHealth:
     mismatches: int = 0
 
     def take(self, segment: Segment, missed: int) -> list[dict[str, np.ndarray]]:
-        """Add a group of time steps to the counts; return a table row for each neighbor list replaced.
+        """Add a group of time steps to the counts. Return a table row for each replaced list.
 
         Args:
             segment: the engine's record.
@@ -434,7 +434,7 @@ class ListHealth:
         return rows
 
     def last_row(self) -> dict[str, np.ndarray] | None:
-        """Return the table row of the neighbor list that is in use when a run ends."""
+        """Return the table row of the last neighbor list of a run."""
         return None if self.current is None else self._close(self.current, "end")
 
     def _audit(self, segment: Segment, moved, epoch: Epoch) -> None:
@@ -474,7 +474,7 @@ class ListHealth:
         return {name: np.array([value]) for name, value in values.items()}
 
     def to_dict(self) -> dict:
-        """Return the counts of the monitor as plain values, for storage in a checkpoint."""
+        """Return the counts as plain values, for a checkpoint."""
         epoch = self.current and {**vars(self.current), "lost": sorted(self.current.lost)}
         values = {k: v for k, v in vars(self).items() if k not in ("simulation", "current", "lost")}
         return {**values, "lost": sorted(self.lost), "current": epoch}

@@ -1,4 +1,4 @@
-"""Construction of simulations from Python objects, such as an ASE structure and a potential."""
+"""Construction of simulations from Python objects, such as ASE structures."""
 
 from __future__ import annotations
 
@@ -66,7 +66,7 @@ class Cut:
 
 @dataclass(frozen=True)
 class Term:
-    """A pair potential with its own cutoff, as a term in a sum of pair potentials.
+    """A pair potential with its own cutoff, for a sum of potentials.
 
     Example:
         >>> Term(LennardJones(sigma=2.3, epsilon=0.01), Cut("switched", 8.5))
@@ -204,7 +204,7 @@ def simulation(
 def _integrator(
     kind: str | type[Integrator], numbers: Mapping[str, Any], units: Units, where: str
 ) -> Integrator:
-    """Create an integrator from its name or class; the options of a built-in integrator are validated."""
+    """Create an integrator from its name or class. Options of built-in integrators are validated."""
     made = INTEGRATORS[kind] if isinstance(kind, str) else kind
     return made.of_file(_validated(made, numbers, where), units)
 
@@ -219,7 +219,7 @@ def _validated(kind: type[Integrator], numbers: Mapping[str, Any], where: str) -
 
 
 def _check_instance(integrator: Integrator, units: Units, where: str) -> None:
-    """Check that an integrator's numbers, converted to system-file units, are allowed in a system file.
+    """Check that a system file may contain the numbers of an integrator.
 
     Raises:
         InputError: a number is not a finite float64 scalar, or is out of range.
@@ -259,7 +259,7 @@ def cut(
     *,
     where: str = "",
 ) -> CutPotential:
-    """Truncate a pair potential at a cutoff radius for each pair type; `Cut` describes the arguments.
+    """Truncate a pair potential at a cutoff radius per pair type. `Cut` describes the arguments.
 
     Args:
         weights: weights of the atoms, if any. where: prefix of parameter names in messages.
@@ -289,7 +289,7 @@ def cut(
 
 
 def _check_function(potential: PairFunction, r_cut: np.ndarray, symbols: Sequence[str]) -> None:
-    """Check a user's pair function: it must be callable, not truncated, and symmetric in both atoms."""
+    """Check a user's pair function: callable, not truncated, symmetric in both atoms."""
     here = potential.typed
     is_pair = lambda leaf: isinstance(leaf, tuple)  # noqa: E731
     other = here.with_leaves(
@@ -327,7 +327,7 @@ def _check_function(potential: PairFunction, r_cut: np.ndarray, symbols: Sequenc
 
 
 def common(terms: Mapping[str, Term]) -> Cut:
-    """Return the cutoff of the first term; all terms must use the same comparison (such as r < r_cut).
+    """Return the cutoff of the first term. All terms must have the same comparison (such as r < r_cut).
 
     Raises:
         InputError: there are no terms, or the terms have different comparisons.
@@ -341,7 +341,7 @@ def common(terms: Mapping[str, Term]) -> Cut:
 
 
 def weights(weight: Any, atoms: Atoms, term: str) -> tuple[Any, ...]:
-    """Return the weight of each atom as `CutPotential` expects it (empty if the term has no weights).
+    """Return the weight of each atom for `CutPotential`. Empty if the term has no weights.
 
     Raises:
         InputError: a species or an atom has no weight.
@@ -369,7 +369,7 @@ def closest(model: Any, units: str) -> float:
 
 
 def _is_array(value: Any) -> bool:
-    """Return True if a list represents an array: numbers, or lists of numbers of equal length."""
+    """Return True if a list is an array: numbers, or lists of numbers of equal length."""
     numbers = all(isinstance(leaf, int | float) for leaf in jax.tree.leaves(value))
     try:
         return type(value) in (list, tuple) and numbers and np.array(value).dtype.kind in "iuf"
@@ -378,7 +378,7 @@ def _is_array(value: Any) -> bool:
 
 
 def by_type(value: Any, symbols: Sequence[str], what: str) -> Float[np.ndarray, "types"]:
-    """Return one number per pair type, given one number for all types or one per pair of species.
+    """Return one number per pair type, from one number or one per pair of species.
 
     Raises:
         InputError: the number of a pair is missing or not finite.
@@ -399,7 +399,7 @@ def by_type(value: Any, symbols: Sequence[str], what: str) -> Float[np.ndarray, 
 
 
 def by_species(value: Mapping[str, Any], symbols: Sequence[str], what: str) -> Float[np.ndarray, "species"]:
-    """Return an array with one number per chemical species, in the order of the chemical symbols.
+    """Return one number per species, in the order of the symbols.
 
     Raises:
         InputError: the number of a species is missing or not finite.
@@ -479,7 +479,7 @@ def assembled(
 
 
 def with_atoms(simulation: Simulation, atoms: Atoms, skin: float) -> Simulation:
-    """Create a simulation of other atoms of the same species; potential and settings remain the same.
+    """Create a simulation of other atoms of the same species. Potential and settings stay the same.
 
     Args:
         skin: skin of the Verlet list, length.
@@ -520,7 +520,7 @@ def with_atoms(simulation: Simulation, atoms: Atoms, skin: float) -> Simulation:
 
 
 def in_fixed_point(simulation: Simulation) -> Simulation:
-    """Return the simulation with a fixed-point state; box edges are rounded to the spacing of positions."""
+    """Return the simulation with a fixed-point state. Box edges are rounded to the spacing of positions."""
     masses, policy, units = simulation.masses, simulation.policy, simulation.units
     if (policy.force, policy.decision, policy.accumulate) != ("float64",) * 3:
         raise InputError(

@@ -1,4 +1,4 @@
-"""Choice of a reader for a trajectory file, and parsing of frame selections such as run.xtc@100:."""
+"""Choice of a reader for a trajectory file, and parsing of frames such as run.xtc@100:."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ for _words, _reader in {
 def open_trajectory(
     path: str | Path, topology: str | Path | None = None, slice: str = "", format: str | None = None
 ) -> Trajectory:
-    """Open a trajectory file that MDAnalysis or ASE can read, or the folder of an mdnum run.
+    """Open a trajectory file for MDAnalysis or ASE, or the folder of an mdnum run.
 
     Args:
         path: the file, optionally followed by a frame selection @START:STOP:STEP.
@@ -101,7 +101,7 @@ def open_trajectory(
 
 
 def _reader_of(file: Path, format: str | None) -> Callable[..., Trajectory]:
-    """Return the function that opens a file, given its path, its topology and the requested frames."""
+    """Return the function that opens a file, given path, topology and frames."""
     suffix = (file.with_suffix("") if file.suffix in (".gz", ".bz2") else file).suffix.lower()
     word = (format or suffix[1:]).lower()
     if word in READERS:
@@ -129,7 +129,7 @@ def _reader_of(file: Path, format: str | None) -> Callable[..., Trajectory]:
 
 
 def _first_lines(file: Path) -> tuple[str, str]:
-    """Return the first two lines of a text file in lower case; empty strings for other files."""
+    """Return the first two lines of a text file in lower case. Empty for other files."""
     from ase.io.formats import open_with_compression
 
     try:
@@ -143,7 +143,7 @@ def _first_lines(file: Path) -> tuple[str, str]:
 
 
 def split_path(text: str) -> tuple[Path, str]:
-    """Return (path, slice after the last @); if the whole text is the name of a file, the slice is empty."""
+    """Return (path, slice after the last @). The slice is empty if the whole text is a file."""
     whole = Path(text).expanduser()
     name, at, words = text.rpartition("@")
     if not at or whole.exists():
@@ -154,7 +154,7 @@ def split_path(text: str) -> tuple[Path, str]:
 
 
 def parse_slice(words: str, where: str = "") -> slice:
-    """Parse a slice of frames: "100:", "::10", "-50:", "5" (one frame) or "" (all frames).
+    """Parse a slice of frames: "100:", "::10", "-50:", "5" (one frame) or "" (all).
 
     Raises:
         InputError: the text is not a slice, or its stride is not positive (frames are read forward in time).

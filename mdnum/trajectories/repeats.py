@@ -1,8 +1,8 @@
-"""Detection of frames that repeat the data or the times of earlier frames, for example after a restart.
+"""Detection of frames that repeat earlier frames, for example after a restart.
 
-A run continued from a checkpoint writes some frames again, and concatenated files may share frames. A stopped
-simulation or rejected Monte Carlo move repeats the previous frame, at the same or a later time. After a
-restart with different rounding, times repeat but data differ. The first frame with each time is kept.
+A restarted run writes some frames again. Concatenated files may share frames. A stopped simulation or a
+rejected Monte Carlo move repeats the previous frame. After a restart with different rounding, times repeat
+but data differ. The first frame with each time is kept.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ _SAME = 1e-8
 
 
 def digest(frame: Frame) -> bytes:
-    """Return sixteen bytes that are equal for frames with bitwise identical positions and boxes."""
+    """Return sixteen bytes that are equal for frames with identical positions and boxes."""
     x = np.ascontiguousarray(frame.positions)
     parts = (x[:: max(1, len(x) // _ATOMS)], np.array(crc32(x.data)), frame.box.matrix, frame.box.pbc)
     return blake2b(b"".join(part.tobytes() for part in parts), digest_size=16).digest()
@@ -33,7 +33,7 @@ def digest(frame: Frame) -> bytes:
 
 @dataclass
 class RepeatedFrames:
-    """Record of frames that repeat earlier frames, based on one stored digest per distinct frame.
+    """Record of repeated frames, from one stored digest per distinct frame.
 
     Attributes:
         drop: whether to omit repeated frames from the frames that are yielded.
@@ -72,7 +72,7 @@ class RepeatedFrames:
                 yield frame
 
     def _digest(self, frame: Frame) -> bytes:
-        """Return the digest of a frame, or of an earlier frame that differs only by wrapping of atoms."""
+        """Return the digest of a frame, or of an earlier frame that differs only by wrapping."""
         digested, box = digest(frame), frame.box
         if not box.pbc.all() or not np.linalg.det(box.matrix):
             return digested
@@ -86,7 +86,7 @@ class RepeatedFrames:
         return digested if before == mine else known
 
     def had(self, number: int, time: float) -> bool:
-        """Return True if an earlier frame has the latest frame's time, unless all frames share one time."""
+        """Return True if an earlier frame has the same time, unless all frames do."""
         of = self._times.setdefault(f"{time:.12g}", number)
         if of == number or len(self._times) < 2:
             return False
@@ -98,7 +98,7 @@ class RepeatedFrames:
         return True
 
     def see(self, number: int, digested: bytes) -> bool:
-        """Return True if the next frame, with the given number in the file, repeats an earlier frame."""
+        """Return True if the next frame repeats an earlier frame."""
         # of several that are the same the last one counts, so that no motion is a repeat of the frame before
         place, of = self._known.get(digested, (self._place, number))
         self._known[digested] = self._place, number
@@ -113,6 +113,6 @@ class RepeatedFrames:
         return back > 0
 
     def plain(self, most: int = 100) -> dict[str, Any]:
-        """Return the record of repeated frames as plain Python values, with up to `most` ranges per list."""
+        """Return the record as plain values, with up to `most` ranges per list."""
         sizes = {"frames": self.frames, "stretches": len(self.stretches), "to_the_end": self._back > 0}
         return sizes | {"dropped": self.drop, "ranges": self.stretches[:most], "again": self.again[:most]}

@@ -1,4 +1,4 @@
-"""`mdnum check`: comparison of a system's energies, pairs or dynamics with those of other codes."""
+"""`mdnum check`: comparison of energies, pairs or dynamics with other codes."""
 
 from __future__ import annotations
 
@@ -52,7 +52,7 @@ class Checked:
 
 
 def check(question: str, system: Simulation | System | str | Path, *, allow_code: bool = False) -> Checked:
-    """Compare the energies, the pairs or the dynamics of a system with results of other codes.
+    """Compare the energies, the pairs or the dynamics of a system with other codes.
 
     Example:
         >>> mdnum.check("energy", "argon/liquid-864").report.ok
@@ -89,7 +89,7 @@ def check(question: str, system: Simulation | System | str | Path, *, allow_code
 def _replied(
     question: str, system: str, overrides: Mapping[str, str] | None = None, allow_code: bool = False
 ) -> Reply:
-    """Execute `mdnum check energy SYSTEM`, `mdnum check pairs SYSTEM` or `mdnum check dynamics SYSTEM`."""
+    """Execute `mdnum check` for energy, pairs or dynamics."""
     from mdnum.systems import load
 
     loaded: Any = load(system, overrides, world="md")
@@ -103,7 +103,7 @@ energy, pairs, dynamics = (partial(_replied, question) for question in ("energy"
 
 
 def structure_findings(system: System) -> Iterator[Finding]:
-    """Yield findings on properties of a structure that its author may not expect, such as its temperature."""
+    """Yield findings on unexpected properties of a structure, such as its temperature."""
     atoms = system.atoms
     frame = Frame(0, 0.0, atoms.positions, Box(np.asarray(atoms.cell), np.asarray(atoms.pbc)))
     if (far := far_out(frame)) is not None:
@@ -129,9 +129,9 @@ def structure_findings(system: System) -> Iterator[Finding]:
 
 
 def temperature_findings(start: float, requested: float, atoms: int, unit: str) -> Iterator[Finding]:
-    """Yield a warning if the temperature of the velocities differs greatly from the requested temperature.
+    """Yield a warning if the velocities have a temperature far from the requested one.
 
-    A temperature ratio up to three gives no warning: an ideal crystal soon loses half of its kinetic energy.
+    A temperature ratio up to three gives no warning, as an ideal crystal loses half of its kinetic energy.
     For few atoms, a temperature difference within the statistical scatter gives no warning.
     """
     ratio = start / requested if requested > 0 else 1.0
@@ -143,7 +143,7 @@ def temperature_findings(start: float, requested: float, atoms: int, unit: str) 
 
 
 def would_show(report: Any, units: Units) -> Iterator[str]:
-    """Yield a sentence for each difference from other codes, with the limit above which it is an error."""
+    """Yield a sentence for each difference from other codes, with the limit of an error."""
     from mdnum.references.energy_check import FORCE, ROUNDINGS
 
     if frames := getattr(report, "frames", ()):
@@ -184,7 +184,7 @@ def energy_findings(report: EnergyReport) -> Iterator[Finding]:
 
 
 def dynamics_findings(report: DynamicsReport) -> Iterator[Finding]:
-    """Yield findings from a comparison of a trajectory with a trajectory computed by ASE."""
+    """Yield findings from a comparison of a trajectory with ASE."""
     if not report.ok:
         yield TEXTS.finding(
             "DYNAMICS_DIFFER", *["sudden"] * (report.sudden is not None), steps=len(report.position) - 1,
@@ -195,7 +195,7 @@ def dynamics_findings(report: DynamicsReport) -> Iterator[Finding]:
 
 
 def pair_findings(report: PairsReport) -> Iterator[Finding]:
-    """Yield findings from a comparison of the pair sets that several neighbor searches return."""
+    """Yield findings from a comparison of the pairs of several neighbor searches."""
     for one in report.results:
         if one.verdict in ("differs", "failed"):
             code = "PAIRS_DIFFER" if one.verdict == "differs" else "SEARCH_FAILED"

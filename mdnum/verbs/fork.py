@@ -1,4 +1,4 @@
-"""`mdnum fork`: the step and the cause of the divergence of two runs that differ in one numerical choice.
+"""`mdnum fork`: when and why two runs diverge that differ in one numerical choice.
 
 `fork` varies one numerical choice of an MD or bouncing-ball simulation. `fork_screen` varies each choice in
 turn. `fork_folders` compares or replays two finished runs. `fork_benign` compares ensembles of runs.
@@ -55,7 +55,7 @@ def fork(
     pin: str | None = None,
     **keep: Unpack[Keep],
 ) -> Outcome:
-    """Run a system twice with one numerical difference, and find the step and the cause of divergence.
+    """Run a system twice with one difference, and find when and why the runs diverge.
 
     Example:
         >>> mdnum.fork("argon/crystal-108", "precision.force=float32", steps=500)
@@ -123,7 +123,7 @@ def fork(
 
 
 def _asked_by_default(system: Any) -> Mapping[str, Any]:
-    """Return the default options from the [fork] table of a system file: vary, steps and split."""
+    """Return the defaults from the [fork] table of a system file."""
     from mdnum.systems.load import world_of
 
     if world_of(system) == "md":
@@ -140,9 +140,9 @@ def fork_screen(
     workers: int | None = None,
     **keep: Unpack[Keep],
 ) -> Outcome:
-    """Run a system once per numerical choice; rank the choices by the step at which decisions first differ.
+    """Run a system once per numerical choice. Rank the choices by the first different decision.
 
-    For a single choice, the function `fork` also tests whether a flip is the cause of divergence.
+    For one choice, `fork` also tests whether a flip is the cause.
 
     Example:
         >>> mdnum.fork_screen("argon/crystal-108", steps=200)
@@ -181,7 +181,7 @@ def fork_screen(
 def fork_folders(
     a: str | Path, b: str | Path, *, replay: bool = False, objects: Sequence[Simulation] = (), **asked: Any
 ) -> Outcome:
-    """Compare the settings of two finished runs, and find the step at which the runs diverge.
+    """Compare two finished runs, and find the step at which they diverge.
 
     Example:
         >>> mdnum.fork_folders("runs/liquid-864", "runs/liquid-864-2")
@@ -273,7 +273,7 @@ def fork_benign(
 
 
 def listed() -> Reply:
-    """Execute `mdnum fork choices`: list the numerical choices that can differ between two runs."""
+    """List the numerical choices that can differ between two runs (`mdnum fork choices`)."""
     from mdnum.forks.choices import shipped
 
     document, tables = {}, []
@@ -326,7 +326,7 @@ def page_screen(view: View, verdict: Verdict) -> Page:
 
 
 def _ranking(rows: Any, steps: int, figure: Canvas) -> None:
-    """Draw, for each numerical choice, when states and decisions first differ and when the runs split."""
+    """Draw when decisions first differ and runs split, for each numerical choice."""
     axes = figure.subplots()
     place = np.arange(len(rows))[::-1]
     for name, label, marker, color, filled in (

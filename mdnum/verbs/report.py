@@ -10,7 +10,7 @@ from mdnum.verbs.frame import finish
 
 
 def report(folder: Path) -> Reply:
-    """Judge the results in an output folder again, and write the folder's report page again."""
+    """Judge the results in an output folder again, and rewrite its report page."""
     outcome = finish(folder)
     written = outcome.folder / "report.html"
     kept = {name: outcome.summary[name] for name in HEAD} | {"of": outcome.kind}

@@ -1,8 +1,8 @@
-"""Choices of arithmetic: the floating-point formats of quantities such as forces, and the order of sums.
+"""Choices of arithmetic: floating-point formats, and the order of sums.
 
-The order of a sum is set by the reduction or the neighbor list. The order of pairs in a list depends on how
-and when the list is built. If every list is rebuilt in time, the order of a sum does not change which pairs
-interact. If sums do not depend on their order, a different order must have no effect.
+The reduction or the neighbor list sets the order of a sum. The order of pairs depends on how and when the
+list is built. If every list is rebuilt in time, the order does not change which pairs interact. An exact sum
+does not depend on the order of its terms.
 """
 
 from __future__ import annotations
@@ -44,10 +44,10 @@ FORMATS = ("dense", "sparse", "ordered-sparse")
 
 @choice("precision")
 class PrecisionChoice(Choice):
-    """Another floating-point format in one or several parts of the calculation, such as the forces.
+    """Another floating-point format of quantities such as the forces.
 
-    In molecular dynamics, 16-bit floats are allowed only for pair forces. For other quantities, 16-bit
-    floats would change the model, not only the rounding (see `mdnum.numerics.roles.check_role`).
+    In molecular dynamics, 16-bit floats are allowed only for pair forces. For other quantities, 16-bit floats
+    would change the model (see `mdnum.numerics.roles.check_role`).
     """
 
     screened: ClassVar = {
@@ -115,7 +115,7 @@ class PrecisionChoice(Choice):
 
 @choice("reduction")
 class Summation(Choice):
-    """Another order of a sum: of the forces on an atom, or of the residuals in a stopping criterion."""
+    """Another order of a sum of forces, or of residuals in a stopping criterion."""
 
     screened = " ".join(f"reduction={word}" for word in reductions.BY_NAME)
     shown = True
@@ -143,7 +143,7 @@ class Summation(Choice):
 
 
 def sums_residuals(system: Any) -> None:
-    """Raise an `InputError` unless the solver of a ball system sums residuals over several balls."""
+    """Raise an `InputError` unless a ball solver sums residuals over several balls."""
     stop = system.spec.stop
     applies(stop is not None, "its steps use no solver, so there is no residual to sum")
     reason = f"its solver is stopped by the rule {stop.rule}, which sums nothing"
@@ -155,9 +155,9 @@ def sums_residuals(system: Any) -> None:
 
 @choice("order")
 class Order(Summed):
-    """The neighbors of each atom, or the balls of the batch, in another order.
+    """The neighbors of each atom, or the balls, in another order.
 
-    For balls, both runs can use exact sums of residuals ("exact") or stop each ball separately ("alone").
+    For balls, both runs can have exact sums ("exact") or a separate stop per ball ("alone").
     """
 
     worlds = ("md", "ball")
@@ -174,7 +174,7 @@ class Order(Summed):
 
     @property
     def must_hold(self) -> bool:  # type: ignore[override]
-        """True if sums do not depend on order, or if the solver stops separately for each ball."""
+        """True if sums do not depend on order, or each ball stops separately."""
         return self.both in (*ORDERLESS, "alone")
 
     def describe(self, world: str = "md") -> str:
@@ -237,7 +237,7 @@ class Order(Summed):
 
 @choice("format")
 class FormatChoice(Summed):
-    """Forces on each atom added in the order of neighbors in another neighbor-list format."""
+    """Forces added in the order of another neighbor-list format."""
 
     screened = "format=dense format=sparse format=ordered-sparse format=ordered-sparse@exact"
     shown = True
@@ -288,7 +288,7 @@ class Builder(Summed):
 
 @choice("skin")
 class Skin(Summed):
-    """Another skin width: neighbor lists contain more or fewer pairs, and are rebuilt at other steps."""
+    """Another skin width. It changes the pairs in neighbor lists and the steps of rebuilds."""
 
     screened = "skin skin@exact"
     # of the skin; None for half as much again, or three quarters where the box has no room
@@ -328,7 +328,7 @@ class RebuildChoice(Summed):
 
     @property
     def must_hold(self) -> bool:  # type: ignore[override]
-        """True if sums do not depend on order, and neighbor lists contain all pairs inside the cutoff."""
+        """True if sums do not depend on order, and lists contain all pairs inside the cutoff."""
         return super().must_hold and self.every in (1, None)
 
     @classmethod

@@ -1,6 +1,6 @@
-"""Choices of how a run starts: parameters, coordinates, random noise, and physically equivalent states.
+"""Choices of how a run starts: parameters, coordinates, noise, and equivalent states.
 
-Other atom labels, another origin, other axes and other periodic images describe the same physical system.
+Other atom labels, origins, axes and periodic images describe the same physical system.
 """
 
 from __future__ import annotations
@@ -94,8 +94,8 @@ class Relabel(Summed):
 class Rotate(Summed):
     """The axes of the box exchanged or reversed.
 
-    An exchange of axes is exact, but it changes the order in which squared components of a distance are
-    added. If the sign of an axis changes, positions are rounded once more when they are wrapped into the box.
+    An exchange of axes is exact. It changes the order of the sum of a squared distance. A change of sign
+    rounds positions once more, when they are wrapped into the box.
     """
 
     screened = "rotate rotate@exact"
@@ -127,7 +127,7 @@ class Rotate(Summed):
 
 
 def _is_symmetry(word: str, atoms: Any) -> bool:
-    """True if exchanging the axes leaves the box unchanged, up to the signs of its lattice vectors."""
+    """True if the exchange of axes leaves the box unchanged, up to signs."""
     axes, signs = _read(word)
     rows = {tuple(row) for row in np.asarray(atoms.cell)[np.asarray(atoms.pbc)].tolist()}
     turned = {tuple(sign * row[k] for k, sign in zip(axes, signs, strict=True)) for row in rows}
@@ -135,14 +135,14 @@ def _is_symmetry(word: str, atoms: Any) -> bool:
 
 
 def _read(word: str) -> tuple[list[int], list[float]]:
-    """Parse a symmetry such as "-x-yz" into the axis at each position and the sign of this axis."""
+    """Parse a symmetry such as "-x-yz" into axes and signs."""
     parts = re.findall("-?[xyz]", word)
     return ["xyz".index(part[-1]) for part in parts], [-1.0 if part[0] == "-" else 1.0 for part in parts]
 
 
 @choice("translate")
 class Translate(Summed):
-    """All atoms moved by a fraction of the lattice vectors: larger coordinates are rounded differently."""
+    """All atoms moved by a fraction of the lattice vectors. This changes the rounding of coordinates."""
 
     screened = "translate=0.25 translate=lattice"
     must_hold = False  # type: ignore[assignment]
@@ -175,9 +175,9 @@ class Translate(Summed):
 class Images(Choice):
     """Atoms that start in other periodic images.
 
-    Positions are wrapped before the first step, so exact images give the same positions bit for bit. Usually,
+    Positions are wrapped before the first step. An exact image gives the same position bit for bit. Usually,
     however, the sum of a position and a lattice vector is rounded. Both runs therefore start from positions
-    with exact images. Atoms start within one ulp of the lattice vector from the positions in the file.
+    with exact images. The positions differ from those in the file by at most one ulp of the lattice vector.
     """
 
     worlds = ("md",)
@@ -217,11 +217,11 @@ class Images(Choice):
 def exact_images(
     cell: Any, positions: Float[np.ndarray, "atoms 3"], images: Int[np.ndarray, "atoms 3"]
 ) -> tuple[Float[np.ndarray, "atoms 3"], Float[np.ndarray, "atoms 3"], int]:
-    """Move atoms slightly to make images exact; return positions, images and the number of inexact images.
+    """Move atoms slightly to make images exact. Return positions, images and the number of inexact images.
 
     Wrapping an exact image restores the wrapped position, bit for bit. In an orthogonal box, wrapping a
-    rounded image gives a position with an exact image, because the lattice vector is subtracted exactly
-    (Sterbenz's lemma). A second iteration is needed only if the first one moved an atom out of the box.
+    rounded image gives a position with an exact image (Sterbenz's lemma). A second iteration is needed only
+    if an atom moved out of the box.
     """
     from mdnum.md.cell import wrap_positions
 
@@ -240,10 +240,9 @@ def exact_images(
 
 @choice("ulps")
 class Ulps(Choice):
-    """A parameter of the system file, changed to a nearby float in the format in which the parameter is used.
+    """A parameter of the system file, changed to a nearby float.
 
-    In a run at constant energy, the temperature in the system file determines only the initial velocities,
-    which both runs draw at random.
+    At constant energy, the temperature in the system file sets only the initial velocities.
     """
 
     screened: ClassVar = {world: " ".join(f"ulps={key}" for key in keys) for world, keys in OFTEN.items()}

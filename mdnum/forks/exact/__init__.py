@@ -1,1 +1,1 @@
-"""Exact arithmetic for the time steps of a run, to certify the decisions of finite-precision runs."""
+"""Exact arithmetic for time steps, to certify decisions in finite precision."""

@@ -1,10 +1,9 @@
-"""Search for the first operation of a reverse pass whose result is not finite, although the run is finite.
+"""Search for the first operation of a reverse pass that gives an infinite or NaN result.
 
-For example, a force can be finite while its derivative is not, a loss can contain a square root at zero, or a
-sum can overflow in the reverse pass. The reverse pass is repeated up to the first step that gives a
-non-finite number. The operations of this step are then run one by one. An operation is the cause if its
-inputs are finite, its result is not finite, and a finite number in place of the result makes the program's
-result finite. Numbers that are masked out later are therefore not a cause.
+Examples are a square root at zero in the loss, and an overflow of a sum. The reverse pass is repeated up to
+the first step with a non-finite number. The operations of this step are then run one by one. An operation is
+the cause if its inputs are finite and its result is not. A finite number in place of the result must make the
+program's result finite. Numbers that are masked out later are therefore not a cause.
 """
 
 from __future__ import annotations
@@ -41,7 +40,7 @@ _PARTS = (
 
 @dataclass(frozen=True)
 class NotFinite:
-    """The step, operation and pair of atoms at which numbers in a reverse pass become infinite or NaN."""
+    """The step, operation and pair of atoms with the first infinite or NaN result."""
 
     found: bool = False  # whether it does at all
     forward: bool = True  # whether the forward run, its loss included, is finite
@@ -66,7 +65,7 @@ def detective(
     tape: RunTape | None = None,
     progress: Progress | None = None,
 ) -> NotFinite:
-    """Find the first step, operation and pair of atoms for which a result of the reverse pass is not finite.
+    """Find the first step, operation and pair with an infinite or NaN result.
 
     Args:
         problem: the loss of a rollout of a pair potential.
@@ -120,7 +119,7 @@ def _in_forward(tape: RunTape) -> NotFinite:
 
 
 def _looked_into(back: StretchReversal, stretch: TapeStretch, row: int) -> NotFinite:
-    """Run the reverse pass of one time step operation by operation; find the cause of non-finite numbers."""
+    """Run the reverse pass of one step operation by operation. Find the cause of non-finite numbers."""
     whole = back.arguments(stretch)
     loss, origin, *rest = whole[8]
     # the energy of the frame of step 0 is not known there, and nothing that is finite has used it
@@ -138,7 +137,7 @@ def _looked_into(back: StretchReversal, stretch: TapeStretch, row: int) -> NotFi
 
 
 def _rows(arguments: tuple[Any, ...], first: int, end: int) -> tuple[Any, ...]:
-    """Restrict the arguments of a reverse pass to a range of time steps, and return these arguments."""
+    """Restrict the arguments of a reverse pass to a range of time steps."""
     out = list(arguments)
     for k in (4, 5, 7):
         out[k] = jax.tree.map(lambda leaf: leaf[first:end], out[k])
@@ -152,7 +151,7 @@ def _rows(arguments: tuple[Any, ...], first: int, end: int) -> tuple[Any, ...]:
 def _pair(
     back: StretchReversal, stretch: TapeStretch, row: int, made: Operation | None, part: str
 ) -> tuple[int, int, float]:
-    """Return the atoms and distance of the pair of atoms to which a result belongs, or -1, -1, NaN."""
+    """Return the atoms and the distance of the pair of a result, or -1, -1, NaN."""
     nowhere = (-1, -1, float("nan"))
     if made is None or not made.index:
         return nowhere

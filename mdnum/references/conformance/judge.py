@@ -1,4 +1,4 @@
-"""Compare the pairs from a neighbor list with the exact pairs, classify errors, and count the results."""
+"""Compare the pairs from a neighbor list with the exact pairs."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ SILENT = ("CRASHED", "NO_ANSWER", "RAISED")  # those of cases in which nothing c
 
 @dataclass(frozen=True)
 class Truth(PairSet):
-    """Exact pairs for one call of a neighbor list in a test case, and pairs slightly beyond the cutoff."""
+    """Exact pairs of a test case, and pairs slightly beyond the cutoff."""
 
     # positions, cell: as the list was given them; rows of axes that do not repeat are zero
     positions: ndarray
@@ -46,16 +46,16 @@ class Truth(PairSet):
     reach: float  # pairs as far as this may be listed, length; the cutoff unless a list holds a skin
 
     def needed(self, unit: float) -> ndarray:
-        """Return a mask of the exact pairs that a neighbor list with a given unit roundoff must contain."""
+        """Return a mask of the pairs that a list with a given unit roundoff must contain."""
         return self.distance < self.r_cut - unit * self.scale
 
     def allowed(self, unit: float) -> ndarray:
-        """Return a mask of the exact pairs that a neighbor list with a given unit roundoff may contain."""
+        """Return a mask of the pairs that a list with a given unit roundoff may contain."""
         return self.distance <= self.reach + unit * self.scale
 
 
 def truth(case: Case, step: int, *, reach: float | None = None, unit: float = DOUBLE) -> Truth:
-    """Compute the exact pairs for one call of a neighbor list: those it must return, and those it may return.
+    """Compute the pairs that a neighbor list must return, and those that it may return.
 
     Args:
         reach: largest distance of the pairs, length; the cutoff by default.
@@ -81,10 +81,10 @@ def truth(case: Case, step: int, *, reach: float | None = None, unit: float = DO
 
 
 def conditioning(cell: ndarray, pbc: ndarray) -> float:
-    """Factor, at least 1, by which conversion to fractional coordinates and back can amplify rounding errors.
+    """Factor (at least 1) by which fractional coordinates amplify rounding errors.
 
     Source: Higham, Accuracy and Stability, 2nd ed., section 7.1. The factor is the condition number of the
-    periodic lattice vectors. Each vector is first scaled to length 1, because lengths alone have no effect.
+    periodic lattice vectors. Each vector is first scaled to length 1.
     """
     if not pbc.any():
         return 1.0
@@ -93,9 +93,9 @@ def conditioning(cell: ndarray, pbc: ndarray) -> float:
 
 
 def keys(count: int, i: ndarray, j: ndarray, shift: ndarray | None, *others: tuple) -> list[ndarray]:
-    """Return an integer key for each row (i, j, shift) and each row of `others`; equal rows have equal keys.
+    """Return an integer key for each row (i, j, shift). Equal rows have equal keys.
 
-    `count` is the number of atoms; without shifts, rows with the same two atoms have equal keys.
+    Rows of `others` have keys, too. `count` is the number of atoms.
     """
     sets = [(i, j, shift), *others]
     lengths = np.cumsum([0, *(len(rows[0]) for rows in sets)])
@@ -118,7 +118,7 @@ def keys(count: int, i: ndarray, j: ndarray, shift: ndarray | None, *others: tup
 
 @dataclass(frozen=True)
 class Conventions:
-    """Conventions of a neighbor list, such as the sign of shifts; every convention is accepted as correct."""
+    """Conventions of a neighbor list, such as the sign of shifts. Every convention is correct."""
 
     full: bool = True  # every pair from both of its atoms (True), or once (False)
     sign: int = 1  # +1 where shifts are added to atom j, -1 where they are added to atom i
@@ -136,21 +136,21 @@ class Failure:
 
     @property
     def kind(self) -> tuple[str, str]:
-        """Error code and exception message, which must not change when the test case is reduced."""
+        """Error code and exception message. They stay the same in a reduced test case."""
         text = self.text if self.code in ("RAISED", "CRASHED", "MALFORMED") else ""
         return self.code, without_numbers(text)
 
 
 def without_numbers(text: str) -> str:
-    """Replace the numbers in a message by a symbol, so that messages that differ in numbers compare equal."""
+    """Replace the numbers in a message, so that messages can be compared."""
     return re.sub(r"[-+\d.e]+", "#", text)
 
 
 def judge(answer: ListAnswer, truth: Truth, how: Conventions) -> list[Failure]:
-    """Return all errors in the pairs from a neighbor list; the result is empty if there are no errors.
+    """Return all errors in the pairs from a neighbor list. Without errors, the result is empty.
 
     A pair within rounding error of the cutoff (`Truth.scale` times the unit roundoff) may be listed or
-    omitted, if the lists of its two atoms agree.
+    omitted. The lists of its two atoms must agree.
 
     Args:
         truth: exact pairs, including all distances at which pairs may be listed.
@@ -241,7 +241,7 @@ def _compare(answer: ListAnswer, truth: Truth, how: Conventions) -> list[Failure
 
 
 def _through(shift: ndarray) -> str:
-    """Return a periodic image shift as text; the text is empty for a zero shift."""
+    """Return a periodic image shift as text. The text of a zero shift is empty."""
     return f" + ({', '.join(str(int(part)) for part in shift)})" if np.any(shift) else ""
 
 
@@ -253,7 +253,7 @@ def _both(truth: Truth) -> tuple[ndarray, ndarray, ndarray]:
 
 
 def _one_way(i: ndarray, j: ndarray, shift: ndarray) -> tuple[ndarray, ndarray, ndarray]:
-    """Orient every pair so that i < j or, for i = j, so that the first nonzero shift is positive."""
+    """Orient every pair so that i < j. For i = j, the first nonzero shift is positive."""
     a, b, c = shift.T if len(shift) else np.zeros((3, 0), np.int64)
     leading = (a > 0) | ((a == 0) & ((b > 0) | ((b == 0) & (c > 0))))
     turn = (i > j) | ((i == j) & ~leading)
@@ -273,7 +273,7 @@ def _shift_hint(answer: ListAnswer, truth: Truth, how: Conventions) -> str:
 
 
 def _measures(answer: ListAnswer, truth: Truth, how: Conventions) -> list[Failure]:
-    """Return the errors of distances and vectors in a neighbor list whose pairs are correct."""
+    """Return the errors of distances and vectors for correct pairs."""
     if answer.distance is None and answer.vector is None:
         return []
     # a bound for a length near the cutoff; a code may form it from squares of its coordinates' differences
@@ -309,14 +309,14 @@ def _measures(answer: ListAnswer, truth: Truth, how: Conventions) -> list[Failur
 
 
 def shown_error(answer: ListAnswer, truth: Truth, how: Conventions) -> tuple[float, float] | None:
-    """Return the rounding error of the listed pairs, or None if pairs are wrong even for float32."""
+    """Return the rounding error of the pairs. None if they are wrong even for float32."""
     units = 2.0 ** np.arange(-52, -23)
     unit = next((unit for unit in units if not judge(answer, truth, replace(how, unit=unit))), None)
     return None if unit is None else (float(unit * truth.scale), float(unit / DOUBLE))
 
 
 def measures_well(answer: ListAnswer, truth: Truth, how: Conventions) -> bool:
-    """Return whether the listed distances or vectors are as accurate as the declared unit roundoff."""
+    """Return whether distances or vectors are as accurate as the declared unit roundoff."""
     given = answer.distance is not None or answer.vector is not None
     n = len(truth.positions)
     named = bool(((answer.i >= 0) & (answer.i < n) & (answer.j >= 0) & (answer.j < n)).all())
@@ -324,7 +324,7 @@ def measures_well(answer: ListAnswer, truth: Truth, how: Conventions) -> bool:
 
 
 def _nearest(mine: ndarray, told: ndarray, theirs: ndarray, length: ndarray) -> ndarray:
-    """Return the absolute difference between each value and the nearest reference value with the same key."""
+    """Return the difference between each value and the nearest reference value with the same key."""
     order = np.lexsort((length, theirs))
     theirs, length = theirs[order], length[order]
     first, last = np.searchsorted(theirs, mine, "left"), np.searchsorted(theirs, mine, "right")
@@ -382,16 +382,16 @@ class Failed:
 
 @dataclass
 class CaseAnswers:
-    """Results of all test cases by case number, and failures reduced to a few atoms.
+    """Results of test cases by number, and failures reduced to a few atoms.
 
-    Test cases are not stored, because a resumed test generates the same test cases from the same seed.
+    Test cases are not stored: the seed generates them again.
     """
 
     cases: dict[str, CaseResult] = field(default_factory=dict)
     shrunk: dict[str, Failed] = field(default_factory=dict)
 
     def of(self, number: int, case: Case) -> CaseResult | None:
-        """Return the stored result of a test case, if any; raise InputError if the stored case differs."""
+        """Return the result of a test case, if any. Raise InputError if the stored case differs."""
         result = self.cases.get(str(number))
         if result is None:
             return None
@@ -421,7 +421,7 @@ class RefusalKind:
 
 @dataclass
 class AreaTally:
-    """Numbers of test cases in one area of the suite, counted by their results."""
+    """Numbers of test cases in one area, by result."""
 
     # asked, refused, skipped: cases; refused by the list itself, skipped because of its limits
     asked: int = 0
@@ -432,12 +432,12 @@ class AreaTally:
 
     @property
     def failed(self) -> int:
-        """Number of test cases with wrong pairs, or with an exception instead of pairs."""
+        """Number of test cases with wrong pairs or an exception."""
         return sum(self.codes.values())
 
     @property
     def silent(self) -> int:
-        """Number of failed test cases in which the neighbor list crashed, raised an error or timed out."""
+        """Number of test cases in which the neighbor list crashed, raised an error or timed out."""
         return sum(self.codes.get(code, 0) for code in SILENT)
 
     @property
@@ -512,9 +512,9 @@ class Report:
             tally.why[result.refused[1]] = tally.why.get(result.refused[1], 0) + 1
 
     def reach(self, case: Case) -> float:
-        """Return the largest distance allowed for a pair in a list that may include pairs beyond the cutoff.
+        """Return the largest distance of pairs in a list that may go beyond the cutoff.
 
-        Since the neighbor list was built, both atoms of a pair may have moved as far as the skin allows.
+        Since the search, both atoms of a pair may have moved as far as the skin allows.
         """
         usual = case.r_cut + 2 * case.skin if case.skin else 1.5 * case.r_cut
         own = 0.3 * (self.padding or 1.0)  # asked with a skin of 0.3 cutoffs
