@@ -83,7 +83,7 @@ def examined(simulation: Simulation) -> dict[str, Any] | None:
 
 
 def _walked(shared: PairPotential) -> Callable[..., tuple[float, float]]:
-    """Return a function of pair-type parameters and distance that computes the energy and force of a pair."""
+    """Return a function that computes the energy and force of a pair from its parameters and distance."""
 
     @jax.jit
     def evaluate(own, r):
@@ -97,7 +97,7 @@ def _walked(shared: PairPotential) -> Callable[..., tuple[float, float]]:
 
 
 def _ends(cutoff: Any, shared: PairPotential) -> Callable[..., Any]:
-    """Return a function for the truncated energy and its first derivatives just below given distances."""
+    """Return a function for the truncated energy and its first derivatives at given distances."""
 
     @jax.jit
     def evaluate(own, r_cut, r_onset, r):
@@ -116,7 +116,7 @@ def _ends(cutoff: Any, shared: PairPotential) -> Callable[..., Any]:
 
 
 def _order(derivatives: np.ndarray) -> int:
-    """Return the order of the last continuous derivative of energy at the cutoff; -1 if the energy jumps."""
+    """Return the order of the last continuous derivative of energy at the cutoff. -1 if the energy jumps."""
     for order, row in enumerate(derivatives):
         usual = float(np.median(np.abs(row[np.isfinite(row)]))) if np.isfinite(row).any() else 0.0
         if not abs(row[-1]) <= _NOTHING[min(order, 1)] * usual:
@@ -125,7 +125,7 @@ def _order(derivatives: np.ndarray) -> int:
 
 
 def _breaks(at: Callable[[float], tuple[float, float]], low: float, r_cut: float) -> list[dict[str, Any]]:
-    """Return discontinuities and other defects of a pair function between two distances, as table rows."""
+    """Return defects of a pair function between two distances, as table rows."""
     step = (r_cut - low) / _INTERVALS
     curve, high = Curve(at), r_cut * (1 + _BEYOND)
     grid = np.linspace(low, high, int(np.ceil((high - low) / step)) + 1)
@@ -172,7 +172,7 @@ def _breaks(at: Callable[[float], tuple[float, float]], low: float, r_cut: float
 
 
 def _share(four: np.ndarray, width: float) -> np.ndarray:
-    """Relative difference between the energy change and the work of a force interpolated by cubics."""
+    """Relative difference between the energy change and the work of the interpolated force."""
     u, f = np.moveaxis(four, -1, 1)
     with np.errstate(invalid="ignore"):
         change, work = u[2] - u[1], (13 * (f[1] + f[2]) - f[0] - f[3]) * width / 24
@@ -180,7 +180,7 @@ def _share(four: np.ndarray, width: float) -> np.ndarray:
 
 
 def _poles(curve: Curve, grid: np.ndarray, force: np.ndarray) -> list[float]:
-    """Return distances at which the force diverges, that is, grows each time the point spacing is reduced."""
+    """Return distances at which the force diverges. It grows there each time the spacing is reduced."""
     inner = force[1:-1]
     peaks = 1 + np.flatnonzero((inner >= force[:-2]) & (inner >= force[2:]) & (inner > 0))
     found, usual = [], np.median(force[np.isfinite(force)])

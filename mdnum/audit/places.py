@@ -1,4 +1,4 @@
-"""Detect errors at certain places in the list of atoms, such as the last atom or every eighth atom."""
+"""Detect errors at certain places in the list of atoms, such as the last one."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ _PLACES, _CANDIDATES = 48, 4  # places that are tried, and of them for an ordina
 
 @dataclass(frozen=True)
 class WrongPlaces:
-    """Places in the list of atoms at which energy or forces are wrong, whichever atom is listed there."""
+    """Places in the list of atoms at which energy or forces are wrong for any atom."""
 
     places: tuple[int, ...]
     count: int  # of atoms
@@ -27,25 +27,25 @@ class WrongPlaces:
 
     @property
     def pattern(self) -> str:
-        """Pattern of the wrong places in the list: "first", "last", "every" (every nth atom) or "some"."""
+        """Pattern of the wrong places: "first", "last", "every" (every nth atom) or "some"."""
         if len(self.places) == 1:
             return {0: "first", self.count - 1: "last"}.get(self.places[0], "some")
         return "every" if len(set(np.diff(self.places).tolist())) == 1 else "some"
 
     @property
     def values(self) -> dict[str, Any]:
-        """Values for the text of a finding about places in the list of atoms with wrong results."""
+        """Values for the text of a finding about wrong places in the list of atoms."""
         shown = ", ".join(map(str, self.places[:8])) + (", …" if len(self.places) > 8 else "")
         every = int(np.diff(self.places)[0]) if self.pattern == "every" else 0
         return {"places": shown, "every": every, "wrong_places": len(self.places), "count": self.count}
 
 
 def wrong_places(subject: CalculatorSubject, atoms: Atoms, allowed: NoiseFloor) -> WrongPlaces | None:
-    """Find places in the list of atoms with wrong results, by exchanging atoms of one species in the list.
+    """Find places in the list of atoms with wrong results, by exchanging like atoms.
 
-    Exchanging two like atoms between correct places in the list changes neither energy nor forces. An error
-    tied to a place appears there for any order of the atoms. An error that depends on the order of all atoms,
-    such as a neglected neighbor, appears at nearly all places in the list, or moves if atoms are reordered.
+    Exchanging two like atoms between correct places changes neither energy nor forces. An error tied to a
+    place appears there for any order of the atoms. Other errors depend on the order of all atoms, such as a
+    neglected neighbor. They appear at nearly all places, or move if atoms are reordered.
 
     Returns:
         None if energy and forces are correct at all places, or if they are wrong at nearly all places.
@@ -75,7 +75,7 @@ def _wrong_places(subject: CalculatorSubject, atoms: Atoms, allowed: NoiseFloor)
 def _at_places(
     subject: CalculatorSubject, atoms: Atoms, order: np.ndarray, places: Sequence[int], allowed: NoiseFloor
 ) -> dict[int, tuple[bool, bool]]:
-    """Test whether energy and forces change if two atoms are exchanged in the list, one at a correct place.
+    """Test whether energy and forces change if two atoms are exchanged, one of them at a correct place.
 
     Returns:
         for each tested place, whether energy and forces change; empty if most places of a species are wrong.

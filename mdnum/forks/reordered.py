@@ -1,15 +1,15 @@
-"""Simulations whose neighbor lists are reordered: in the order of a jax-md format, or at random.
+"""Simulations with reordered neighbor lists: in the order of a jax-md format, or at random.
 
-Newton's third law holds exactly, so the format of a neighbor list changes only the order of sums. A dense or
-sparse list contains each pair of atoms twice, and each entry contributes half of the pair force. In a sparse
-list, the entries in an atom's own row form one sum, those in other rows a second sum; both sums are added. A
-loop over atom labels gives the same result if rows are sorted. In a dense list, entries in other rows are
-added one by one to the sum over the atom's own row. An ordered-sparse list contains each pair of atoms once.
-Forces from atoms with larger labels form one sum, and forces from atoms with smaller labels form another.
+Newton's third law holds exactly. The format of a list thus changes only the order of sums. A dense or sparse
+list contains each pair twice. Each entry contributes half of the pair force. In a sparse list, entries in an
+atom's own row form one sum, those in other rows a second sum. Both sums are added. A loop over atom labels
+gives the same result if rows are sorted. In a dense list, entries in other rows are added one by one to the
+sum over the atom's own row. An ordered-sparse list contains each pair of atoms once. Forces from atoms with
+larger labels form one sum, those from smaller labels another.
 
 Source: jax_md.smap.pair_neighbor_list of jax-md 0.2.29, whose forces are reproduced bit for bit
-(tests/forks/test_choices.py). For an atom with more than 32 slots, XLA adds the slots in blocks of 32, which
-this module does not reproduce.
+(tests/forks/test_choices.py). XLA adds more than 32 slots of an atom in blocks of 32. This module does not
+reproduce that.
 """
 
 from __future__ import annotations
@@ -30,13 +30,13 @@ _SUMS: Mapping[str, Reduction] = {"dense": Twice(), "sparse": Sequential(), "ord
 
 @dataclass(frozen=True)
 class ReorderedSimulation(Simulation):
-    """A simulation in which the pairs of each neighbor list are in a prescribed or random order."""
+    """A simulation whose neighbor lists have a prescribed or random order of pairs."""
 
     order: str | int = 0  # a format, or the seed of a shuffle
 
     @classmethod
     def of(cls, simulation: Simulation, order: str | int) -> ReorderedSimulation:
-        """Create a simulation with reordered neighbor lists; sequential sums follow the order of the list."""
+        """Create a simulation with reordered neighbor lists. Sequential sums follow this order."""
         same = _fields(Simulation, simulation)
         if isinstance(order, str) and simulation.reduction == Sequential():
             same["reduction"] = _SUMS[order]
@@ -44,11 +44,11 @@ class ReorderedSimulation(Simulation):
 
     @property
     def lists(self):
-        """Properties that identify neighbor lists, including the order of the pairs in a list."""
+        """Properties that identify neighbor lists, including the order of pairs."""
         return (*super().lists, self.order)
 
     def verlet_list(self, skin: float | None = None) -> VerletList:
-        """Create the Verlet list of the simulation, with the pairs of atoms in the order given by `order`."""
+        """Create the Verlet list of the simulation, with pairs in the order of `order`."""
         made = super().verlet_list(skin)
         if isinstance(self.order, str):
             return FormattedList(**_fields(VerletList, made), format=self.order)
@@ -62,7 +62,7 @@ def _fields(kind: type, value: object) -> dict:
 
 @dataclass
 class FormattedList(VerletList):
-    """A neighbor list with the neighbors of each atom in the order of a jax-md neighbor-list format."""
+    """A neighbor list in the order of a jax-md neighbor-list format."""
 
     # "dense" or "sparse" (by label), or "ordered-sparse" (later atoms in the first half of the slots, earlier
     # ones in the second, both by label)
@@ -70,7 +70,7 @@ class FormattedList(VerletList):
     half: int = 0  # slots of one half; grows with what it must hold
 
     def build(self, positions, cell) -> PairTable:
-        """Build the table of atom pairs from the neighbor search, in the order of the jax-md list format."""
+        """Build the table of atom pairs in the order of the jax-md format."""
         table = super().build(positions, cell)
         atoms = len(table.order)
         labels = np.append(table.order, atoms)[table.index]
@@ -92,7 +92,7 @@ def _first(
     chosen: Bool[np.ndarray, "slots atoms"],
     slots: int,
 ) -> Int[np.ndarray, "kept atoms"]:
-    """Return the selected neighbors of each atom, sorted by label; padding fills the remaining slots."""
+    """Return the selected neighbors of each atom, sorted by label. Padding fills the other slots."""
     atoms = index.shape[1]
     keys = np.where(chosen, labels, atoms)
     order = np.argsort(keys, axis=0, kind="stable")[:slots]
@@ -116,7 +116,7 @@ class ShuffledBuilder:
         return self.inner.name
 
     def build(self, positions, cell, r_list, slots):
-        """Build the table of atom pairs: shuffled neighbors of each atom, with padding at the end."""
+        """Build the table of atom pairs: shuffled neighbors of each atom, then padding."""
         table, order, most = self.inner.build(positions, cell, r_list, slots)
         table, atoms = np.asarray(table), table.shape[1]
         keys = np.random.default_rng(self.seed).random(table.shape)

@@ -1,13 +1,13 @@
-"""Contributions to a gradient from changes of the times at which pairs cross their cutoff (saltation).
+"""Effect on gradients of the times at which pairs cross their cutoff (saltation).
 
-A perturbed pair crosses the cutoff earlier or later. If the force jumps at the cutoff, the change of the
-crossing time also changes the pair's momentum. The derivative at fixed decisions does not include changes of
-crossing times, however short the time steps are. A saltation matrix (mdnum.numerics) at each crossing adds
-the effect of the crossing time. The potential energy and the virial also jump at a crossing. If a loss sums
-energies or virials over equally spaced frames, a later crossing shifts the jump by a fraction of a frame.
+A perturbed pair crosses the cutoff earlier or later. If the force jumps at the cutoff, another crossing time
+also changes the pair's momentum. The derivative at fixed decisions omits this change, however short the time
+step. A saltation matrix (mdnum.numerics) adds it at each crossing. The potential energy and the virial also
+jump at a crossing. If a loss sums energies or virials over frames, a later crossing shifts the jump by a
+fraction of a frame.
 
-For a pair with radial force jump f (positive: repulsive) and radial speed s, a change dr of the distance
-changes the crossing time by -dr/s and the momentum along the pair by f dr/s.
+Let a pair have the radial force jump f (positive: repulsive) and the radial speed s. A change dr of its
+distance changes the crossing time by -dr/s, and the momentum along the pair by f dr/s.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ _ROOM_BITS = 6
 
 
 class Met(NamedTuple):
-    """Cutoff crossings of one step or of a sequence of steps, padded to a fixed size for compilation."""
+    """Cutoff crossings of one or several steps, padded to a fixed size."""
 
     # i, j: sorted atoms; beyond the last one where there is no crossing
     i: Int[Array, "most"]
@@ -52,14 +52,14 @@ class Met(NamedTuple):
 
 
 class MetRows(NamedTuple):
-    """Cutoff crossings of a stretch of steps, padded to a fixed size for compilation."""
+    """Cutoff crossings of a stretch of steps, padded to a fixed size."""
 
     met: Met  # of all rows
     spans: Int[np.ndarray, "room 2"]  # where each row begins, and how many crossings it has
     slots: Int[np.ndarray, "most"]  # numbers from 0, as many as the row with the most has, or a few more
 
     def row(self, span: Int[Array, "2"], atoms: int) -> Met:
-        """Return the crossings of one time step, given the index of the first crossing and their number."""
+        """Return the crossings of one step."""
         most = len(self.slots)
         own = Met(*(lax.dynamic_slice_in_dim(column, span[0], most, -1) for column in self.met))
         # behind them are those of the next row
@@ -70,7 +70,7 @@ class MetRows(NamedTuple):
 
 @dataclass(frozen=True)
 class Crossings:
-    """Cutoff crossings in one stretch of time steps, with normals, radial speeds and force jumps."""
+    """Cutoff crossings in a stretch of steps, with normals, radial speeds and force jumps."""
 
     ledger: FlipTable  # the flips
     row: Int[np.ndarray, "crossings"]  # row of each in its stretch, ascending
@@ -97,18 +97,18 @@ class Crossings:
 
     @property
     def kick(self) -> Float[np.ndarray, "crossings"]:
-        """Force jump (energy/length) of each crossing, divided by the radial speed (length/time): the change
-        of the pair's radial momentum per change of its distance.
+        """Force jump (energy/length) divided by the radial speed (length/time), for each crossing. This is
+        the change of the pair's radial momentum per change of its distance.
         """
         return self.force / self.speed
 
     def spans(self, room: int) -> Int[np.ndarray, "room 2"]:
-        """Return, for each of `room` steps, the index of the first crossing and the number of crossings."""
+        """Return the index of the first crossing and the number of crossings for each of `room` steps."""
         starts = np.searchsorted(self.row, np.arange(room + 1))
         return np.stack([starts[:-1], np.diff(starts)], axis=1)
 
     def rows(self, room: int) -> MetRows:
-        """Return the cutoff crossings of `room` steps, padded to a fixed size for compilation."""
+        """Return the cutoff crossings of `room` steps, padded to a fixed size."""
         spans = self.spans(room)
         most = _padded(int(spans[:, 1].max(initial=0)))
         # a slice of so many fits everywhere
@@ -128,16 +128,16 @@ class Crossings:
         return MetRows(Met(*map(padded, columns)), spans, np.arange(most))
 
     def gathered(self, values: Float[np.ndarray, "room most *rest"]) -> Float[np.ndarray, "crossings *rest"]:
-        """Return an array with one entry per crossing, after removing the padding of each step."""
+        """Return an array with one entry per crossing, without padding."""
         return values[np.arange(values.shape[1]) < self.spans(len(values))[:, 1:]]
 
     def weighed(self, weights: Float[np.ndarray, "room most"]) -> Crossings:
-        """Return a copy of the crossings with the weights that a reverse pass computed."""
+        """Return a copy of the crossings with the weights of a reverse pass."""
         return replace(self, weight=self.gathered(weights))
 
 
 def _padded(count: int) -> int:
-    """Round a count up to a power of four, so that programs are compiled for only a few array sizes."""
+    """Round a count up to a power of four. Programs are then compiled for few array sizes."""
     bits = max(_ROOM_BITS, count.bit_length())
     return 1 << (bits + bits % 2)
 
@@ -157,14 +157,14 @@ def onto_crossings(
 
     On average, a crossing lies halfway through the drift between two steps. Let n be the unit vector from i
     to j, f the force jump, h the lattice vectors, and s = n · (v_j - v_i) + n · (dh/dt h^-1) r the radial
-    speed. A perturbation changes the distance by dr = n · (dx_j - dx_i - dL), where L is the lattice
+    speed. A perturbation changes the distance by dr = n · (dx_j - dx_i - dL). Here L is the lattice
     translation between the images. The duration of the force jump then changes by dr/s:
 
         d(m v_j) = f n dr/s = -d(m v_i)    on the atoms, through the force
         d(W) = (f r_cut n ⊗ n) dr/s        on the integrator's use of the virial tensor W
 
     The cotangent of dr is therefore f/s n · (v̄_j/m_j - v̄_i/m_i) + f r_cut/s n · S n. Here v̄ is the
-    cotangent of v, and S is the cotangent of the virial in a step, divided by the time step.
+    cotangent of v. S is the cotangent of the virial in a step, divided by the time step.
 
     Args:
         met: the crossings between the previous step and this one.
@@ -207,10 +207,10 @@ def of_energy(
     onto: tuple[Float[Array, "3 atoms"], Float[Array, ""], Float[Array, ""]],
     squeeze: Float[Array, "*axes"] | None = None,
 ) -> Float[Array, "most"]:
-    """Compute cotangents of crossing distances from an energy function, evaluated with and without each pair.
+    """Compute cotangents of crossing distances. The energy function is evaluated with and without each pair.
 
     The jump affects all atoms whose energy depends on the pair. The jump is evaluated at the cutoff distance.
-    For other pairs that cross in the same step, the decisions at the end of the step are used.
+    Other pairs have their decisions at the end of the step.
 
     Args:
         met: crossings whose `push` is one over the radial speed, negative where the pair leaves.
@@ -250,8 +250,8 @@ def of_energy(
 def _along(
     met: Met, vectors: Float[Array, "3 atoms"], matrix: Float[Array, "3 3"] | None = None
 ) -> Float[Array, "most"]:
-    """Return, for each pair, the difference between both atoms' vectors, projected onto the pair's direction.
-    If `matrix` contains lattice vectors, the vector of the second atom is that of its nearest image.
+    """Return the difference between both atoms' vectors along each pair.
+    If `matrix` contains lattice vectors, the nearest image of the second atom is used.
     """
     dtype = vectors.dtype
     there = vectors.at[:, met.j].get(mode="fill", fill_value=0)
@@ -295,7 +295,7 @@ def push_through(
 
 
 def crossings(simulation: Simulation, stretch: TapeStretch, guard: float) -> Crossings:
-    """Return the flips of a stretch of steps as crossings, with their normals and radial speeds.
+    """Return the flips of a stretch of steps as crossings.
 
     Args:
         stretch: recorded with its flips.
@@ -318,7 +318,7 @@ def crossings(simulation: Simulation, stretch: TapeStretch, guard: float) -> Cro
     atoms = stretch.x.shape[2]
 
     def positions(rows: np.ndarray, of: np.ndarray) -> np.ndarray:
-        """Return atom positions at the time steps in `rows`; row -1 is the step before the first row."""
+        """Return atom positions at the steps in `rows`. Row -1 is the step before the first row."""
         axes = [of + k * atoms for k in range(3)]
         seen = [x.take(3 * atoms * rows + at, mode="clip") for at in axes]
         return np.stack([np.where(rows < 0, ahead[at], one) for at, one in zip(axes, seen, strict=True)], 1)

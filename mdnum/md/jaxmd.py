@@ -30,7 +30,7 @@ Format = Literal["dense", "sparse", "ordered-sparse"]
 
 
 def _dual(cell: Float[Array, "3 3"], periodic: tuple[int, ...]) -> Float[Array, "3 axes"]:
-    """Return the matrix that maps a vector to its fractional coordinates along periodic axes only."""
+    """Return the matrix that maps a vector to fractional coordinates along periodic axes only."""
     if len(periodic) == 3:
         a, b, c = cell
         dual = jnp.stack([jnp.cross(b, c), jnp.cross(c, a), jnp.cross(a, b)], axis=1)
@@ -44,9 +44,9 @@ def displacement(
 ) -> Displacement:
     """Return a minimum-image displacement function in real coordinates, for jax-md energy functions.
 
-    The image is chosen by rounding fractional coordinates, and integer multiples of lattice vectors are
-    subtracted. If no image is needed, the displacement is the exact difference of the coordinates. Positions
-    may lie outside the box. Derivatives with respect to the cell (stress) are those of the chosen image.
+    Rounded fractional coordinates select the image. Integer multiples of lattice vectors are then subtracted.
+    If no image is needed, the displacement is the exact difference. Positions may lie outside the box.
+    Derivatives with respect to the cell (stress) are those of the chosen image.
 
     Args:
         cell: lattice vectors as rows, length; orthorhombic or triclinic.
@@ -92,7 +92,7 @@ def neighbor_vectors(
     cell: Float[Array, "3 3"],
     pbc: tuple[bool, bool, bool],
 ) -> Float[Array, "atoms slots 3"]:
-    """Return minimum-image vectors from each atom to its neighbors; padding entries give finite vectors."""
+    """Return minimum-image vectors from each atom to its neighbors. Padding gives finite vectors."""
     toward = displacement(cell, pbc)
     others = positions[jnp.where(idx < positions.shape[0], idx, 0)]
     return jax.vmap(lambda here, there: jax.vmap(lambda point: toward(point, here))(there))(positions, others)
@@ -106,13 +106,13 @@ _ROOM = 1.25
 
 
 def standard_promotion() -> AbstractContextManager[None]:
-    """Enable automatic dtype promotion, which jax-md requires because it mixes dtypes even on import."""
+    """Enable automatic dtype promotion. jax-md mixes dtypes even on import."""
     return jax.numpy_dtype_promotion("standard")
 
 
 @contextmanager
 def _quiet_scatter() -> Iterator[None]:
-    """Suppress a jax warning about jax-md, which scatters int64 indices into int32 arrays at every trace."""
+    """Suppress a jax warning about jax-md, which scatters int64 indices into int32 arrays."""
     with warnings.catch_warnings():
         warnings.filterwarnings("ignore", "scatter inputs have incompatible types", FutureWarning)
         yield
@@ -130,10 +130,10 @@ def upstream() -> ModuleType:
 
 
 def scalar(value: float | np.ndarray) -> Float[Array, ""]:
-    """Convert a number to a float64 jax array, the only type that jax-md does not round to float32.
+    """Convert a number to a float64 jax array. jax-md rounds all other types to float32.
 
     Even with x64 enabled, jax_md.util.maybe_downcast converts Python floats, numpy floats and numpy arrays to
-    float32, but not float64 jax arrays. Apply `scalar` to every sigma, epsilon, r_onset and r_cutoff.
+    float32. Apply `scalar` to every sigma, epsilon, r_onset and r_cutoff.
     """
     return jnp.asarray(value, jnp.float64)
 
@@ -152,9 +152,9 @@ def as_neighbor_list(
     self_edges: bool = False,
     code: Any = 0,
 ) -> NeighborList:
-    """Make a jax-md NeighborList, for jax-md energy functions, from the neighbor list of another program.
+    """Make a jax-md NeighborList from the neighbor list of another program.
 
-    The conversion also works inside jit; padding entries keep their places in the arrays.
+    The conversion also works inside jit. Padding entries keep their places.
 
     Args:
         idx_dense: neighbors of each atom, in both directions, padded with the number of atoms. Entries of an
@@ -208,7 +208,7 @@ def listed(
 def multi_image(
     neighbor: NeighborList, x: Float[Array, "atoms 3"], cell: Float[Array, "3 3"], box: Float[Array, "3 3"]
 ) -> Any:
-    """Return a neighbor list with integer shifts of minimum images, in the form of jax_md.custom_partition.
+    """Return a neighbor list with integer shifts of images, as in jax_md.custom_partition.
 
     Args:
         x: positions, length. cell: lattice vectors as rows, length. box: the box in the form that the energy
@@ -230,8 +230,8 @@ def multi_image(
 class PairSearch:
     """Neighbor search of jax-md for one cell, for repeated calls with new positions.
 
-    Positions are passed to jax-md as fractional coordinates in [0, 1), with the distances between opposite
-    faces as the box. For positions outside the box, jax-md loses pairs without an error. The search also
+    Positions are passed to jax-md as fractional coordinates in [0, 1). The box is the distances between
+    opposite faces. For positions outside the box, jax-md loses pairs without an error. The search also
     rejects some valid triclinic boxes. After every search, the overflow flag is read outside jit. After an
     overflow, the neighbor list is enlarged.
 
@@ -266,7 +266,7 @@ class PairSearch:
         self._update = jax.jit(lambda folded, previous: previous.update(folded))
 
     def _frame(self, fractional: np.ndarray) -> None:
-        """Choose origin and length of nonperiodic axes such that all fractional coordinates are in [0, 1)."""
+        """Choose nonperiodic axes such that all fractional coordinates are in [0, 1)."""
         low, high = fractional.min(axis=0), fractional.max(axis=0)
         self._low = np.where(self.pbc, 0.0, low - self.r_list)
         self._span = np.where(self.pbc, 1.0, high - low + 2 * self.r_list)
@@ -302,7 +302,7 @@ class PairSearch:
         return functions.allocate(jnp.asarray(folded))
 
     def __call__(self, positions: Float[np.ndarray, "atoms 3"]) -> Int[np.ndarray, "atoms slots"]:
-        """Return sorted neighbors within r_list, one row per atom, padded with the number of atoms.
+        """Return sorted neighbors within r_list, one row per atom. The number of atoms is the padding.
 
         Raises:
             NumericalError: a position is not finite.

@@ -1,4 +1,4 @@
-"""Tables of the pairs inside the cutoff and of their flips, for simulations and external trajectories."""
+"""Tables of the pairs inside the cutoff and of their flips."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from jaxtyping import Bool, Float, Int
 class Columns:
     """Base class of tables, which are dataclasses with columns of equal length. The first field is an array.
 
-    A field that is not an array is either one text for all rows, or None if the column is unknown.
+    A field without an array is one text for all rows, or None if unknown.
     """
 
     def __len__(self) -> int:
@@ -42,7 +42,7 @@ class Columns:
 
     @classmethod
     def concatenate(cls, parts: Sequence[Any]) -> Any:
-        """Concatenate the rows of one or more tables, keeping only columns that are known in all tables."""
+        """Concatenate the rows of tables. Only columns known in all tables are kept."""
         columns = {name: [vars(one)[name] for one in parts] for name in vars(parts[0])}
         others = {k: [v for v in one if not isinstance(v, np.ndarray)] for k, one in columns.items()}
         return cls(**{k: others[k][0] if others[k] else np.concatenate(one) for k, one in columns.items()})
@@ -50,7 +50,7 @@ class Columns:
 
 @dataclass(frozen=True)
 class Members(Columns):
-    """Pairs inside the cutoff in one frame, sorted by (i, j, rank), without duplicates."""
+    """Pairs inside the cutoff in one frame, sorted by (i, j, rank)."""
 
     i: Int[
         np.ndarray, "pairs"
@@ -65,8 +65,8 @@ class Members(Columns):
 class FlipTable(Columns):
     """Table with one row per flip, sorted by (step or frame, i, j, rank).
 
-    In a run of mdnum, a pair flips if the decision used for its force changes between two steps. For given
-    positions, such as those of a trajectory, flips are computed from the positions in each frame.
+    In a run of mdnum, a flip is a change of the decision used for a pair's force. In a trajectory, flips are
+    computed from the positions in each frame.
     """
 
     i: Int[np.ndarray, "flips"]  # the pair, as in `Members`
@@ -94,6 +94,6 @@ class FlipTable(Columns):
     by_box: Float[np.ndarray, "flips"] | Any = None
 
     def columns(self, rule: int = 0) -> dict[str, Any]:
-        """Return the known columns by their names in flips.parquet, and a column with the rule's index."""
+        """Return the known columns as named in flips.parquet, and a column with the rule's index."""
         known = {name: column for name, column in vars(self).items() if column is not None}
         return {"rule": np.broadcast_to(np.int32(rule), len(self)), **known}

@@ -1,8 +1,8 @@
-"""Sums that do not depend on the order of the terms, and the registry of all summation orders.
+"""Sums that do not depend on the order of the terms. Also the registry of all summation orders.
 
 A finite float is an integer multiple of its format's smallest subnormal number. The exact sum expresses all
-terms as integers, adds the integers in a long accumulator of 32-bit limbs (Kulisch & Miranker 1986), and
-rounds once. The fixed-point sum rounds every term to a coarser unit, so that one int64 can hold the sum.
+terms as integers and adds them in a long accumulator of 32-bit limbs (Kulisch & Miranker 1986). It rounds
+once. The fixed-point sum rounds every term to a coarser unit. One int64 can then hold the sum.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ _MASK = 2**_LIMB - 1
 
 
 def _parts(terms: Float[Array, "n columns"], form: FloatFormat) -> tuple[jax.Array, list[jax.Array]]:
-    """Split each term into signed 32-bit pieces; return the lowest piece's limb index, and all pieces."""
+    """Split each term into signed 32-bit pieces. Return the lowest piece's limb index, and all pieces."""
     bits = lax.bitcast_convert_type(terms, integer_of(terms.dtype)).astype(jnp.int64)
     magnitude = bits & ((1 << (8 * terms.dtype.itemsize - 1)) - 1)
     exponent, fraction = magnitude >> (form.significand - 1), magnitude & ((1 << (form.significand - 1)) - 1)
@@ -56,7 +56,7 @@ def _parts(terms: Float[Array, "n columns"], form: FloatFormat) -> tuple[jax.Arr
 
 
 def _carried(limbs: Int[Array, "limbs columns"]) -> tuple[Int[Array, "columns"], Int[Array, "limbs columns"]]:
-    """Propagate carries between limbs; return the final carry (-1 if negative) and limbs in [0, 2^32)."""
+    """Propagate carries between limbs. Return the final carry (-1 if negative) and limbs in [0, 2^32)."""
 
     def step(carry, limb):
         value = limb + carry
@@ -66,7 +66,7 @@ def _carried(limbs: Int[Array, "limbs columns"]) -> tuple[Int[Array, "columns"],
 
 
 def _rounded(limbs: Int[Array, "limbs columns"], form: FloatFormat) -> UInt64[Array, "columns"]:
-    """Return the bits of the float nearest to a non-negative number given by limbs, ties to even."""
+    """Return the bits of the nearest float to a non-negative number in limbs, ties to even."""
     count = limbs.shape[0]
     filled = limbs != 0
     place = count - 1 - jnp.argmax(filled[::-1], axis=0)
@@ -98,7 +98,7 @@ def _rounded(limbs: Int[Array, "limbs columns"], form: FloatFormat) -> UInt64[Ar
 
 @dataclass(frozen=True)
 class Exact(Reduction):
-    """The exact sum, rounded once to nearest; the result has the same bits for every order of the terms.
+    """The exact sum, rounded once to nearest.
 
     The error is at most half an ulp of the result for up to 2^31 terms. Intermediate sums do not overflow.
     Infinite and NaN terms give the result of IEEE addition.
@@ -126,7 +126,7 @@ class Exact(Reduction):
         return jnp.where(special, jnp.sum(flat, axis=0), total).reshape(shape)
 
     def bound(self, terms: Float[np.ndarray, "n ..."]) -> Float[np.ndarray, "..."]:
-        """Return the error bound: unit roundoff times an upper bound of |sum| that is computed in float64."""
+        """Return the error bound: unit roundoff times an upper bound of |sum|."""
         wide = terms.astype(np.float64)
         total = np.abs(wide.sum(axis=0)) + gamma(len(terms)) * np.abs(wide).sum(axis=0)
         return np.asarray(unit_roundoff(terms.dtype) * total)
@@ -137,8 +137,8 @@ class FixedPoint(Reduction):
     """A fixed-point sum: every term is rounded to a multiple of 2^-bits, and the multiples are added.
 
     The result has the same bits for every order of the n terms. The error is at most n * 2^(-bits - 1) plus
-    the rounding error of the result. If a term exceeds 2^(62 - bits) / n, the sum could overflow, and the
-    result is NaN.
+    the rounding of the result. The result is NaN if a term exceeds 2^(62 - bits) / n, because the sum could
+    overflow.
     """
 
     bits: int = 40  # binary digits after the point, from -1000 to 1000
@@ -156,7 +156,7 @@ class FixedPoint(Reduction):
         return jnp.where(fits, value, jnp.nan).astype(terms.dtype)
 
     def bound(self, terms: Float[np.ndarray, "n ..."]) -> Float[np.ndarray, "..."]:
-        """Return the error bound: 2^(-bits - 1) for each term, plus one rounding of the result."""
+        """Return the error bound: 2^(-bits - 1) per term, plus one rounding of the result."""
         size = np.abs(terms.astype(np.float64)).sum(axis=0)
         return np.asarray(len(terms) * 2.0 ** (-self.bits - 1) + 2 * unit_roundoff(terms.dtype) * size)
 
@@ -165,7 +165,7 @@ class FixedPoint(Reduction):
 
 
 def _numbered(reduction: Callable[[int], Reduction], default: int) -> Callable[..., Reduction]:
-    """Return a function that creates a summation order from the text of its numerical parameter."""
+    """Return a function that creates a summation order from the text of its parameter."""
 
     def make(number: str | None = None) -> Reduction:
         try:

@@ -1,4 +1,4 @@
-"""ASE calculators, adapted to the cutoff, the species and the neighbor list of a simulation."""
+"""ASE calculators, adapted to the cutoff, species and neighbor list of a simulation."""
 
 from __future__ import annotations
 
@@ -77,7 +77,7 @@ class SpeciesSum(ClassicalCalculator):
 
 
 def _results(calculator: Calculator, atoms: Atoms, stress: bool) -> dict[str, Any]:
-    """Return energy, forces, atomic energies (if available) and stress (six numbers) of a structure."""
+    """Return energy, forces, atomic energies (if available) and stress (six numbers)."""
     bare = Atoms(numbers=atoms.numbers, positions=atoms.positions, cell=atoms.cell, pbc=atoms.pbc)
     names = ["energy", "forces", *(["stress"] if stress else [])]
     if "energies" in calculator.implemented_properties:  # ASE's EAM has the total only
@@ -87,7 +87,7 @@ def _results(calculator: Calculator, atoms: Atoms, stress: bool) -> dict[str, An
 
 
 def evaluate(calculator: Calculator, atoms: Atoms) -> dict[str, Any]:
-    """Return energy, forces, stress (3, 3) and atomic energies of a structure; missing values are None."""
+    """Return energy, forces, stress (3, 3) and atomic energies. Missing values are None."""
     # ASE gives a stress for a molecule in a box, of the box's volume
     results = _results(calculator, atoms, atoms.cell.rank == 3 and bool(atoms.pbc.all()))
     if "stress" in results:
@@ -102,7 +102,7 @@ def lennard_jones(form: PairForm, **options: Any) -> Calculator:
 
 
 def _inside_list(form: PairForm) -> Callable[..., Any]:
-    """Return a neighbor list for ASE's MorsePotential that has only pairs inside the system's cutoff."""
+    """Return a neighbor list for ASE's MorsePotential with only pairs inside the cutoff."""
 
     def listed(quantities: str, atoms: Atoms, cutoff: float) -> tuple[ndarray, ...]:
         edges = edges_of(atoms, form.r_cut)
@@ -122,7 +122,7 @@ def morse(form: PairForm, begin: float, end: float) -> Calculator:
 
 
 def short_listed_eam(file: Path) -> Calculator:
-    """Return ASE's EAM with a short neighbor list; the default list, up to 2 (cutoff + skin), is slow."""
+    """Return ASE's EAM with a short neighbor list. The default list, up to 2 (cutoff + skin), is slow."""
     from ase.calculators.eam import EAM
     from ase.neighborlist import NeighborList
 
@@ -139,10 +139,10 @@ def short_listed_eam(file: Path) -> Calculator:
 
 
 class EnergyOnNeighborList(ClassicalCalculator):
-    """ASE calculator for an energy function, compiled separately and evaluated on ASE's neighbor list.
+    """ASE calculator for an energy function, evaluated on ASE's neighbor list.
 
-    The calculator is a reference for neighbor lists, cutoff decisions and time steps. The energy function and
-    its derivatives are not tested, because the calculator computes them with jax, too.
+    The calculator is a reference for neighbor lists, cutoff decisions and time steps. It does not test the
+    energy function and its derivatives: jax computes both here, too.
     """
 
     implemented_properties = ["energy", "free_energy", "forces", "stress"]  # noqa: RUF012

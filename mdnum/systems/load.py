@@ -1,4 +1,4 @@
-"""Find and load system files: shipped systems by name, a user's files by path."""
+"""Find and load system files, shipped or of the user."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ def names(world: Literal["md", "ball"] | None = None) -> list[str]:
 
 
 def world_of(name: Any) -> str:
-    """Return "ball" for a bouncing-ball system, otherwise "md"; the system file is not validated.
+    """Return "ball" for a bouncing-ball system, otherwise "md". The file is not validated.
 
     Raises:
         InputError: no system has this name.
@@ -62,7 +62,7 @@ def _world(path: Path) -> str:
 
 
 def find(name: str | Path) -> tuple[str, Path]:
-    """Find the name and file of a system, given a TOML file, a folder with system.toml, or a shipped name.
+    """Find the name and file of a system from a TOML file, a folder with system.toml, or a shipped name.
 
     Raises:
         InputError: no system has this name; the message suggests the most similar shipped name.
@@ -97,7 +97,7 @@ def find(name: str | Path) -> tuple[str, Path]:
 
 
 def shown(path: Path) -> str:
-    """Return a path for use in messages, relative to the working directory if the path lies inside it."""
+    """Return a path for messages, relative to the working directory if it lies inside."""
     try:
         return str(path.resolve().relative_to(Path.cwd()))
     except ValueError:
@@ -152,13 +152,13 @@ class System:
 
     @property
     def without_skin(self) -> System:
-        """The same system with a Verlet skin of 0, for boxes that are too small for a skin."""
+        """The same system with a Verlet skin of 0, for small boxes."""
         neighbors = self.spec.neighbors.model_copy(update={"skin": 0.0})
         return replace(self, spec=self.spec.model_copy(update={"neighbors": neighbors}))
 
     @property
     def ignored(self) -> list[str]:
-        """Columns of the structure file that look like velocities but are not read as velocities."""
+        """Columns of the structure file that resemble velocities but are not read."""
         structure = self.spec.structure
         return structures.ignored(structure, self.folder) if structure.velocities == "file" else []
 
@@ -169,7 +169,7 @@ class System:
 
     @property
     def program(self) -> dict[str, Any]:
-        """All parameters and settings of the system except its structure, as plain values, for hashing."""
+        """All settings of the system except its structure, as plain values for hashing."""
         made = self.spec.model_dump(mode="json", exclude=_NOT_THE_PROGRAM)
         if made.get("terms") is None:
             made.pop("terms", None)
@@ -271,7 +271,7 @@ class BallSystem:
         return BallSystem(self.name, spec, self.path, {**self.variants, name: variant})
 
     def for_steps(self, steps: int) -> BallSystem:
-        """Return this system with another number of steps, and with one control acceleration per step.
+        """Return this system with another number of steps. Each step has one control acceleration.
 
         Args:
             steps: number of steps of a run, at least 1.
@@ -289,7 +289,7 @@ class BallSystem:
         return replace(self, spec=self.spec.model_copy(update=update))
 
     def to_toml(self, *, beside: bool = True) -> str:
-        """Return the text of the system file, with all default values; `beside` has no effect."""
+        """Return the text of the system file, with all default values. `beside` has no effect."""
         return toml.dump({"name": self.name, **self.spec.model_dump(exclude_none=True)})
 
     def write(self, folder: str | Path) -> Path:
@@ -300,7 +300,7 @@ class BallSystem:
 
 
 def vary(name: str, changes: Mapping[str, Any], base: BallSpec, where: str) -> BallSpec:
-    """Change the values of some keys of a system, and return the validated tables of the system file.
+    """Change the values of some keys of a system. Return the validated tables.
 
     Raises:
         InputError: the changed system cannot be run.
@@ -340,7 +340,7 @@ def vary(name: str, changes: Mapping[str, Any], base: BallSpec, where: str) -> B
 
 
 def copy(name: str | Path, folder: str | Path) -> Path:
-    """Copy a shipped system with its structure and potential tables, for editing; return the new system file.
+    """Copy a shipped system with its structure and potential tables, for editing. Return the new system file.
 
     Raises:
         InputError: the system does not exist, or a file with this name already exists.
@@ -394,7 +394,7 @@ def load(
     *,
     world: Literal["md", "ball"] | None = None,
 ) -> System | BallSystem:
-    """Load and validate a system; return a BallSystem if its file has `world = "ball"`, otherwise a System.
+    """Load and validate a system. Return a BallSystem if its file has `world = "ball"`, otherwise a System.
 
     Example:
         >>> mdnum.load("argon/liquid-864").spec.cutoff.kind
@@ -491,7 +491,7 @@ def _ball(spec: BallSpec, source: Source) -> BallSystem:
 
 
 def json_schema(file: str) -> dict[str, Any]:
-    """Return the JSON schema of system files, which editors use to check and complete keys."""
+    """Return the JSON schema of system files. Editors use it to check and complete keys."""
     root, title = (BallSpec, " of the ball") if file == BALL_SCHEMA else (schema.SystemSpec, "")
     return {
         "$schema": "https://json-schema.org/draft/2020-12/schema",

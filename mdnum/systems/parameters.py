@@ -1,13 +1,13 @@
-"""Parameters of a simulation: their paths, values and units, and simulations with changed parameter values.
+"""Parameters of a simulation: their paths, values and units, and how to change them.
 
-A parameter is a number or an array of numbers, and its name is a path. Paths are keys of a system file
-("potential.sigma", "cutoff.radius", "dynamics.timestep") or lead to a component of a potential
+A parameter is a number or an array of numbers. Its name is a path. Paths are keys of a system file
+("potential.sigma", "cutoff.radius", "dynamics.timestep"). They may also lead to a component of a potential
 ("potential.layers.0.weight"). A single array entry is also a parameter, such as "potential.pairs.Ni-P.sigma"
-(as in system files), "position.17.x", "velocity.17.x" or "potential.layers.0.weight.3.2" (a path with
+or "position.17.x". Further examples are "velocity.17.x" and "potential.layers.0.weight.3.2" (a path with
 indices).
 
 `dynamics.temperature` is the temperature of the thermostat. Drawn velocities scale with the square root of
-temperature; velocities read from a file do not change. `velocity.scale` scales all initial velocities. For a
+temperature. Velocities from a file do not change. `velocity.scale` scales all initial velocities. For a
 cutoff without switching, the onset equals `cutoff.radius`. `box.scale` scales lattice vectors and positions.
 """
 
@@ -75,7 +75,7 @@ class Parameter:
 
 
 def parameters(simulation: Simulation) -> dict[str, Parameter]:
-    """Return all parameters of a simulation by path; use `changed` to change their values.
+    """Return all parameters of a simulation by path. `changed` changes their values.
 
     Example:
         >>> mdnum.parameters(sim)["potential.sigma"].value
@@ -126,7 +126,7 @@ def with_number(simulation: Simulation, name: str, given: float) -> Simulation:
 
 
 def is_positive(simulation: Simulation, name: str) -> bool:
-    """Return True if a parameter must be positive; coordinates and weights can have any sign."""
+    """Return True if a parameter must be positive."""
     whole = entry(simulation, name).whole
     if "potential." in whole:
         return _is_typed(simulation, whole) and number(simulation, name) > 0
@@ -134,7 +134,7 @@ def is_positive(simulation: Simulation, name: str) -> bool:
 
 
 def by(simulation: Simulation, name: str) -> str:
-    """Return "pair type", "species" or "atom" if a parameter has one entry for each, otherwise ""."""
+    """Return "pair type", "species" or "atom" if a parameter has one entry for each, else ""."""
     if name.startswith("initial.") or is_weight(name):
         return "atom"
     if not _is_typed(simulation, name) or simulation.pair_types == 1:
@@ -143,7 +143,7 @@ def by(simulation: Simulation, name: str) -> str:
 
 
 def is_weight(name: str) -> bool:
-    """Return True if a path refers to the weights of the atoms in a term of the potential."""
+    """Return True if a path refers to atom weights in a term of the potential."""
     return name.startswith("terms.") and name.split(".")[2:] == ["weight"]
 
 
@@ -158,7 +158,7 @@ def _by_species(simulation: Simulation) -> set[str]:
 
 
 def unit(simulation: Simulation, name: str) -> str:
-    """Return the unit of a parameter; "" for a pure number, and "[name]" if the unit is not known."""
+    """Return the unit of a parameter: "" for a pure number, "[name]" if unknown."""
     table, whole = name.partition(".")[0], entry(simulation, name).whole
     last = whole.rpartition(".")[2]
     field = simulation.integrator.keys().get(last) if table == "dynamics" else None
@@ -169,7 +169,7 @@ def unit(simulation: Simulation, name: str) -> str:
 
 
 def value(simulation: Simulation, name: str) -> Float[np.ndarray, "..."]:
-    """Return the value of a parameter, as a scalar if there is only one pair type."""
+    """Return the value of a parameter. It is a scalar if there is only one pair type."""
     place = entry(simulation, name)
     if place.index:
         return np.asarray(value(simulation, place.whole)[place.index] * place.factor)
@@ -188,7 +188,7 @@ def value(simulation: Simulation, name: str) -> Float[np.ndarray, "..."]:
 
 
 def leaf_of(model: Any, name: str) -> Any:
-    """Return the array that contains a parameter of a potential or of its cutoff."""
+    """Return the array of a parameter of a potential or of its cutoff."""
     if not isinstance(model, CutPotential | Channels):
         return quantities_of(model)[name.removeprefix("potential.")]
     return pair_leaves(model)[name]
@@ -197,9 +197,9 @@ def leaf_of(model: Any, name: str) -> Any:
 def pair_leaves(model: CutPotential | Channels, shared: bool = True, species: bool = True) -> dict[str, Any]:
     """Return the parameter arrays of pair potentials and of their cutoffs, by path.
 
-    The argument `shared` adds arrays that do not depend on the pair type, and `species` adds arrays with one
-    entry per species. If all cutoff radii are equal, `cutoff.radius` is the path of this common radius. If
-    cutoff radii differ, each term has its own path, and terms with equal cutoff radii share one array.
+    `shared` adds arrays that do not depend on the pair type. `species` adds arrays with one entry per
+    species. If all cutoff radii are equal, their path is `cutoff.radius`. Otherwise each term has its own
+    path. Terms with equal cutoff radii share one array.
     """
     found: dict[str, Any] = {}
     for part in model.parts:
@@ -218,7 +218,7 @@ def pair_leaves(model: CutPotential | Channels, shared: bool = True, species: bo
 
 
 def shared_radius(model: Any, name: str) -> tuple[str, ...]:
-    """Return the potential terms that share the cutoff radius at a path; none if only one term has it."""
+    """Return the potential terms that share the cutoff radius at a path, if several do."""
     table, term, key = (*name.split(".", 2), "", "")[:3]
     if table != "terms" or key != "cutoff.radius":
         return ()
@@ -228,7 +228,7 @@ def shared_radius(model: Any, name: str) -> tuple[str, ...]:
 
 
 def with_values(simulation: Simulation, values: Mapping[str, Any]) -> Simulation:
-    """Return the simulation with other parameter values, without repeating the checks of system files.
+    """Return the simulation with other parameter values, without the checks of system files.
 
     Raises:
         InputError: a value is not finite, is complex, has the wrong shape, or is not allowed.
@@ -248,7 +248,7 @@ def with_values(simulation: Simulation, values: Mapping[str, Any]) -> Simulation
 
 
 def _with(simulation: Simulation, name: str, new: np.ndarray) -> Simulation:
-    """Return the simulation with another value of a parameter; the shape is not checked."""
+    """Return the simulation with another value of a parameter, without a check of its shape."""
     table, _, key = name.partition(".")
     model, integrator = simulation.model, simulation.integrator
     if table == "potential" and not simulation.pairwise:
@@ -289,7 +289,7 @@ def _with(simulation: Simulation, name: str, new: np.ndarray) -> Simulation:
 
 
 def _heated(simulation: Simulation, new: float) -> Simulation:
-    """Set the temperature of initial velocities: draw them again, or scale them if they were changed."""
+    """Set the temperature of initial velocities. They are drawn again, or scaled if they were changed."""
     old = simulation.draw
     heated = replace(simulation, draw=replace(old, temperature=new))
     if not (old.temperature and old.drawn) and "temperature" in simulation.integrator.numbers():
@@ -307,7 +307,7 @@ def _heated(simulation: Simulation, new: float) -> Simulation:
 
 
 class Entry(NamedTuple):
-    """Parameter to which a path refers, index of the array entry, and the factor that converts its unit."""
+    """Parameter of a path, index of the array entry, and unit conversion factor."""
 
     whole: str  # path of the parameter
     index: tuple[int, ...] = ()  # which of its entries; empty for all of it
@@ -315,7 +315,7 @@ class Entry(NamedTuple):
 
 
 def entry(simulation: Simulation, name: str) -> Entry:
-    """Find the parameter or array entry to which a path refers; an unknown path is returned unchanged."""
+    """Find the parameter or array entry of a path. An unknown path is returned unchanged."""
     if (of_pair := _of_pairs(simulation).get(name)) is not None:
         return of_pair
     table, *at = name.split(".")
@@ -353,7 +353,7 @@ def _of_pairs(simulation: Simulation) -> dict[str, Entry]:
 
 
 def resolve(simulation: Simulation, word: str, known: Sequence[str]) -> str:
-    """Find the parameter path for a name, which can be a path, an alias or an unambiguous end of a path.
+    """Find the path of a parameter from a path, an alias or an unambiguous end of a path.
 
     Args:
         word: a path, an alias such as "r_cut" or "dt", or an ending that only one path has.
@@ -385,8 +385,8 @@ def resolve(simulation: Simulation, word: str, known: Sequence[str]) -> str:
 def changed(simulation: Simulation, values: Mapping[str, Any]) -> Simulation:
     """Change values of system-file keys or parameters; return the new, validated simulation.
 
-    A simulation from a system file is rebuilt from this file with the new values. If a changed parameter has
-    no key in system files, the new simulation has no system file.
+    A simulation from a system file is rebuilt with the new values. The new simulation has no system file if a
+    changed parameter has no key there.
 
     Example:
         >>> mdnum.changed(sim, {"cutoff.radius": 9.0, "precision.force": "float32"})
@@ -426,7 +426,7 @@ def _of_file(system: System, values: Mapping[str, Any]) -> Simulation:
 
 
 def _changed(simulation: Simulation, key: str, given: Any) -> Simulation:
-    """Change one key in a simulation that was made from objects; return the new simulation."""
+    """Change one key in a simulation that was made from objects."""
     table, _, name = key.partition(".")
     if key == "precision.reduction":
         return replace(simulation, reduction=REDUCTIONS.parse(given))
@@ -461,7 +461,7 @@ def _changed(simulation: Simulation, key: str, given: Any) -> Simulation:
 
 
 def redrawn(simulation: Simulation) -> Simulation:
-    """Return the simulation with velocities drawn at random instead of those of its structure."""
+    """Return the simulation with randomly drawn velocities."""
     if simulation.file is not None:
         return changed(simulation, {"structure.velocities": "drawn"})
     return _drawn(replace(simulation, draw=replace(simulation.draw, drawn=True)))

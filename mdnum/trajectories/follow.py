@@ -1,7 +1,7 @@
-"""Frame-by-frame reading of one trajectory, or of two for comparison, with frame checks and flip detection.
+"""Frame-by-frame reading of one trajectory, or of two for comparison.
 
-The neighbor sets of two trajectories are compared completely only at the first frame. At later frames, the
-difference of the sets is updated with the flips, at a cost proportional to the number of flips.
+Neighbor sets of two trajectories are compared completely only at the first frame. Later, only the flips
+update the difference of the sets.
 """
 
 from __future__ import annotations
@@ -104,7 +104,7 @@ def _usable(
 
 
 class NeighborCounts:
-    """Number of neighbors of each atom in the first group, updated at every frame from the flips."""
+    """Number of neighbors of each atom in the first group, updated from the flips."""
 
     def __init__(self, members: Members, atoms: int, groups: Groups, directed: bool):
         self._sides = [None if one is None else np.isin(np.arange(atoms), one) for one in groups]
@@ -126,7 +126,7 @@ class NeighborCounts:
             np.add.at(self._now, one, counts)
 
     def count(self) -> tuple[int, float, int]:
-        """Return (fewest, mean, most) neighbors per atom at a frame; add the frame to the histogram."""
+        """Return (fewest, mean, most) neighbors per atom at a frame. Add the frame to the histogram."""
         here = np.bincount(self._now if self._atoms is None else self._now[self._atoms])
         if len(here) > len(self.seen):
             self.seen = np.pad(self.seen, (0, len(here) - len(self.seen)))
@@ -138,7 +138,7 @@ class NeighborCounts:
 
 @dataclass
 class Followed:
-    """Tracker, neighbor counts and statistics for one membership rule, updated as frames are read."""
+    """Tracker, neighbor counts and statistics for one membership rule."""
 
     rule: Rule
     tracker: Tracker | ResidueTracker  # of it
@@ -170,10 +170,10 @@ def follow(
     trajectory: Trajectory, rules: Sequence[Rule], groups: Groups, resolution: Resolution, sink: Sink,
     residues: ByResidue | None = None,
 ) -> Iterator[Pass]:  # fmt: skip
-    """Read each frame once, and pass rows of the tables "members", "flips", "frames", "motion" to `sink`.
+    """Read each frame once. Pass rows of the tables "members", "flips", "frames" and "motion" to `sink`.
 
     If `residues` is given, pairs of residues are examined; `groups` still contains atoms. The same `Pass` is
-    yielded after each frame, and iteration may stop at any frame. Memory use does not grow with the number of
+    yielded after each frame. Iteration may stop at any frame. Memory use does not grow with the number of
     frames. Reading ends at the first unreadable or unusable frame; earlier results are kept.
 
     Raises:
@@ -223,7 +223,7 @@ def follow(
 def _hand_on(
     sink: Sink, number: int, one: Followed, flips: FlipTable, frame: Frame, at: int, size: tuple[int, Groups]
 ) -> None:
-    """Pass the table rows of one frame and one membership rule to the function `sink`."""
+    """Pass the table rows of one frame and one membership rule to `sink`."""
     if one.neighbors is None:
         members = one.tracker.members()
         one.neighbors = NeighborCounts(members, *size, one.rule.directed)
@@ -282,7 +282,7 @@ def _measure_flux(one: Followed, frame: Frame, groups: Groups, species: list[str
 
 @dataclass
 class SetDifference:
-    """Pairs (i, j, rank) that are neighbors in one of two trajectories only, updated with their flips."""
+    """Pairs (i, j, rank) that are neighbors in only one of two trajectories."""
 
     only_a: set[Pair] = field(default_factory=set)
     only_b: set[Pair] = field(default_factory=set)
@@ -302,7 +302,7 @@ class SetDifference:
         return len(self.only_a) + len(self.only_b)
 
     def step(self, a: FlipTable, b: FlipTable) -> None:
-        """Update the difference of the neighbor sets with the flips of both trajectories at one frame."""
+        """Update the difference of the neighbor sets with the flips at one frame."""
         differed: dict[Pair, bool] = {}
         for flips, mine, others in ((a, self.only_a, self.only_b), (b, self.only_b, self.only_a)):
             columns = (flips.i.tolist(), flips.j.tolist(), flips.rank.tolist(), flips.entered.tolist())
@@ -320,7 +320,7 @@ class SetDifference:
 
 
 def distances(frame: Frame, pairs: list[Pair], directed: bool = False) -> Float[np.ndarray, "pairs"]:
-    """Return the distances of pairs (i, j, rank of periodic image); inf if there is no such image."""
+    """Return the distances of pairs (i, j, rank of periodic image). Missing images give inf."""
     i, j, rank = np.array(pairs, np.int64).reshape(-1, 3).T
     at = Placed(np.ascontiguousarray(frame.positions), lattice_of(frame.box), 0.0)
     return image_distances(at, np.minimum(i, j), np.maximum(i, j), rank, directed)
@@ -339,7 +339,7 @@ class ComparedSide:
     bound: float = 0.0  # how far a margin can be off
 
     def step(self, frame: Frame) -> FlipTable:
-        """Process the next frame of this trajectory; return the flips since the previous frame."""
+        """Process the next frame of this trajectory. Return the flips since the previous frame."""
         self.distance_bound = self.resolution.bound(frame)
         self.box_bound = self.resolution.bound(frame, np.zeros(0, np.int64))
         # a margin among the nearest is the difference of two distances
@@ -347,7 +347,7 @@ class ComparedSide:
         return self.tracker.step(frame, bound=self.bound)
 
     def position_bound(self, periods: int) -> float:
-        """Return the error bound of a position, for distances across up to `periods` periods of the box."""
+        """Return the error bound of a position, up to `periods` periods of the box away."""
         # a distance has two atoms that are off
         return (self.distance_bound - self.box_bound) / 2 + max(1, periods) * self.box_bound
 
@@ -361,10 +361,9 @@ class ComparedSide:
 def differing_rows(
     pairs: list[Pair], difference: SetDifference, sides: Sequence[ComparedSide], frames: Sequence[Frame]
 ) -> dict[str, np.ndarray]:
-    """Return table columns for the pairs that are inside the cutoff in only one of the two trajectories.
+    """Return table columns for the pairs inside the cutoff in only one trajectory.
 
-    A pair is ambiguous if rounding of the coordinates in one of the files may have moved the pair across the
-    threshold.
+    A pair is ambiguous if rounded coordinates in a file may have moved it across the threshold.
     """
     rule = sides[0].tracker.rule
     i, j, rank = (np.array([pair[k] for pair in pairs], np.int64) for k in range(3))
@@ -400,7 +399,7 @@ def _thresholds(
 
 @dataclass
 class NeighborSets:
-    """Neighbor sets of one membership rule in two trajectories, and the difference of the sets."""
+    """Neighbor sets of one membership rule in two trajectories, and their difference."""
 
     rule: Rule
     sides: list[ComparedSide]
@@ -432,7 +431,7 @@ class Compared:
 
 
 def follow_both(sets: list[NeighborSets], atoms: AtomIndices, sink: Sink) -> Iterator[Compared]:
-    """Read two trajectories frame by frame, comparing the given atoms; yield a `Compared` after each frame.
+    """Read two trajectories frame by frame. Yield a `Compared` after each frame.
 
     Rows of the tables "apart" and "differing" are passed to the function `sink`.
     """
@@ -486,10 +485,10 @@ def follow_both(sets: list[NeighborSets], atoms: AtomIndices, sink: Sink) -> Ite
 def _apart(
     found: Compared, a: Frame, b: Frame, atoms: AtomIndices, sides: Sequence[ComparedSide]
 ) -> tuple[Separation, float]:
-    """Return each atom's distance between two files after removing a common shift, and an error bound.
+    """Return each atom's distance between two files without a common shift, and an error bound.
 
-    A shift common to all atoms is removed only if it explains nearly all of the distances. A common shift can
-    result from different origins of two files, or from removal of center-of-mass motion in one file.
+    A common shift is removed only if it explains nearly all of the distances. It can result from different
+    origins, or from removed center-of-mass motion in one file.
     """
     now = separation(a, b, atoms)
     allowed = sum(side.position_bound(now.periods) for side in sides)
@@ -518,7 +517,7 @@ def _sets_at(
     now: Separation,
     before: Separation,
 ) -> None:
-    """Record the difference of two neighbor sets at a frame, and write pairs that are now in only one set."""
+    """Record the difference of two neighbor sets at a frame, and write new pairs of only one set."""
     difference, first = one.difference, False
     if one.certain is None and len(difference):
         # all that differ: one that came to differ within the resolution may be beyond it by now
@@ -545,7 +544,7 @@ def _sets_at(
 
 
 def growth_of(frames: int, one: NeighborSets, table: Mapping[str, np.ndarray]) -> dict[str, Any]:
-    """Return growth rates of the distance between two runs, before and after neighbor sets first differ."""
+    """Return growth rates of the distance between two runs, before and after neighbor sets differ."""
     cutoff, furthest = isinstance(one.rule, CutoffRule), float(table["furthest"].max(initial=0.0))
     limit = 0.1 * (one.rule.reach if cutoff else furthest)
     cut = frames if one.first is None else one.first["frame"]

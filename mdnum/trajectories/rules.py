@@ -1,8 +1,8 @@
-"""Membership rules, which define the neighbors of an atom and the margin of every decision.
+"""Membership rules: they define the neighbors of an atom.
 
-A membership rule is *symmetric* (i and j are neighbors of each other) or *directed* (j may be a neighbor of i
-although i is not a neighbor of j). Squared distances are compared in float64. Each rule has a different
-margin for two atoms at distance r; it is a length, positive for neighbors:
+A rule is *symmetric* if i and j are neighbors of each other. In a *directed* rule, j may be a neighbor of i
+although i is not a neighbor of j. Squared distances are compared in float64. Every decision has a margin, a
+length that is positive for neighbors. For two atoms at distance r, it is:
 
     CutoffRule      r_cut - r
     SpeciesCutoffs  r_cut of the two species - r
@@ -52,7 +52,7 @@ class _Membership:
 
     @property
     def shortest(self) -> float:
-        """Smallest cutoff radius, in length units; infinite if the neighbors are the k nearest atoms."""
+        """Smallest cutoff radius (length). It is infinite if the neighbors are the k nearest atoms."""
         return self.reach
 
     def table(
@@ -66,8 +66,8 @@ class _Membership:
 class CutoffRule(_Membership):
     """Rule by which a pair is inside if its distance is less than `radius` (length).
 
-    Membership is decided by comparing r² with radius² in float64, as in most codes. A pair whose distance
-    equals the radius within rounding error is marked as ambiguous.
+    Membership is decided by comparing r² with radius² in float64. A pair is ambiguous if its distance equals
+    the radius within rounding error.
     """
 
     radius: float
@@ -170,7 +170,7 @@ class Nearest(_Membership):
 class Capped(_Membership):
     """Directed rule: the neighbors of an atom are the `most` nearest atoms inside a cutoff radius.
 
-    Graph builders that limit the number of neighbors and keep the nearest atoms follow this rule.
+    Graph builders that keep only the nearest atoms follow this rule.
     """
 
     radius: float
@@ -191,5 +191,5 @@ Rule = CutoffRule | SpeciesCutoffs | Nearest | Capped
 
 
 def smallest_radius(rules: Sequence[Rule]) -> float:
-    """Return the smallest cutoff radius of several rules (length); infinite if no rule has a radius."""
+    """Return the smallest cutoff radius of several rules (length), or infinity."""
     return float(min((one.shortest for one in rules), default=math.inf))

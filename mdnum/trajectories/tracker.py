@@ -1,4 +1,4 @@
-"""Tracking, from frame to frame, of pairs that become or cease to be neighbors under a membership rule."""
+"""Tracking of pairs that become or cease to be neighbors under a membership rule."""
 
 from __future__ import annotations
 
@@ -54,7 +54,7 @@ class Moment(Placed):
 class Tracker:
     """Tracker of the flips between consecutive frames, as defined by a membership rule.
 
-    A tracker stores a single frame, so its memory does not grow with the number of frames. It can be pickled.
+    A tracker stores a single frame, however many frames it reads. It can be pickled.
 
     Args:
         rule: the membership rule that defines neighbors.
@@ -105,7 +105,7 @@ class Tracker:
         self.min_margin = np.inf
 
     def step(self, frame: Frame, bound: float | None = None) -> FlipTable:
-        """Process the next frame; return the flips since the previous frame, or no flips at the first frame.
+        """Process the next frame. Return the flips since the previous frame (none at the first frame).
 
         Args:
             frame: the next frame; `frame.index` is used only in error messages.
@@ -157,7 +157,7 @@ class Tracker:
         return Members(first, second, rank, distances)
 
     def thresholds(self) -> tuple[Float[np.ndarray, "atoms"], Float[np.ndarray, "atoms"]]:
-        """Return a directed rule's cutoff distances at the last frame; nan for atoms that are not centers.
+        """Return a directed rule's cutoff distances at the last frame. They are nan except for centers.
 
         Returns:
             (distance below which a neighbor stays one, distance below which another atom becomes a neighbor).
@@ -198,7 +198,7 @@ class Tracker:
         return Moment(positions, lattice, rounding, np.zeros(len(self._who.radii), np.int64), none, none)
 
     def _decided(self, now: Moment) -> Moment:
-        """Find the neighbors at a frame, store the number of pairs, and return the frame and neighbors."""
+        """Find the neighbors at a frame and store their number."""
         rule, bound, who = self.rule, self.bound + now.rounding, self._who
         if isinstance(rule, Nearest | Capped):
             reach = rule.reach if np.isfinite(rule.reach) else 0.0
@@ -238,7 +238,7 @@ class Tracker:
     # ---- two frames
 
     def _from_list(self, before: Moment, now: Moment) -> FlipTable | None:
-        """Return the flips found in the list of cluster pairs (tiles); None if the list is unusable."""
+        """Return the flips found in the list of cluster pairs. None if the list is unusable."""
         who, bound, horizon = self._who, self.bound + now.rounding, HORIZON * self._who.radius
         clear = max(bound, horizon)
         if self._list is not None and not self._list.serve(before, now, who.radius, clear):
@@ -265,7 +265,7 @@ class Tracker:
         return self._table(before, now, Changed._make(map(np.concatenate, zip(*parts, strict=True))))
 
     def _table(self, before: Moment, now: Moment, changed: Changed) -> FlipTable:
-        """Convert arrays of changed pairs, with indices of participating atoms, to a table of flips."""
+        """Convert arrays of changed pairs to a table of flips."""
         directed, who, count = self.rule.directed, self._who, len(changed.i)
         i, j, images = who.labels[changed.i], who.labels[changed.j], int(changed.rank.max(initial=0)) + 1
         if not directed:
@@ -299,7 +299,7 @@ def _participants(
     species: np.ndarray | None,
     atoms: int,
 ) -> Participants:
-    """Number the atoms to which the membership rule applies, in the order of the file."""
+    """Number the atoms to which the rule applies, in the order of the file."""
     first = np.arange(atoms) if first is None else first
     second = first if second is None else second
     for name, chosen in (("first", first), ("second", second)):
@@ -322,7 +322,7 @@ def _participants(
 
 
 def _by_place(who: Participants, frame: Frame) -> Participants:
-    """Renumber the atoms by position, so that atoms close in space are close in memory."""
+    """Renumber the atoms so that atoms close in space are close in memory."""
     x, largest = _taken(frame.positions, who.labels)
     if not np.isfinite(largest) or not who.radius > 0:
         return who
@@ -335,7 +335,7 @@ def _by_place(who: Participants, frame: Frame) -> Participants:
 
 
 def _taken(positions: np.ndarray, labels: np.ndarray) -> tuple[Float[np.ndarray, "taken 3"], float]:
-    """Return the positions of the given atoms, and the largest |coordinate|, which may be inf or nan."""
+    """Return the positions of the given atoms, and the largest |coordinate| (possibly inf or nan)."""
     x = np.take(np.asarray(positions, np.float64), labels, axis=0)
     return x, furthest(x)
 

@@ -1,4 +1,4 @@
-"""`mdnum flips`: a table of all flips (pairs entering or leaving a cutoff) in any program's trajectory."""
+"""`mdnum flips`: a table of all flips (pairs entering or leaving a cutoff) in a trajectory."""
 
 from __future__ import annotations
 
@@ -84,7 +84,7 @@ def flips(
     drop_repeats: bool = False,
     **keep: Unpack[Keep],
 ) -> Outcome:
-    """Find all pairs that cross a cutoff between frames of a trajectory, and compute contact statistics.
+    """Find all pairs that cross a cutoff between frames of a trajectory.
 
     Example:
         >>> mdnum.flips("run.dcd", topology="start.pdb", cutoffs=[8.5])
@@ -171,7 +171,7 @@ def flips_each(
     progress: Progress | None = None,
     **options: Any,
 ) -> list[Outcome | MdnumError]:
-    """Find the flips in each of several trajectories, such as replicas, independently of each other.
+    """Find the flips in each of several trajectories, such as replicas.
 
     Example:
         >>> mdnum.flips_each(["a.xtc", "b.xtc"], topology="a.gro", cutoffs=[4.0], workers=2)
@@ -263,7 +263,7 @@ def _replied(trajectories: Sequence[str], **given: Any) -> Reply:
 
 @dataclass
 class FrameExamination:
-    """Examination of a trajectory, frame by frame, with the output folder for the results."""
+    """Examination of a trajectory, frame by frame."""
 
     answer: Answer  # its folder takes what follows from the tables, when all frames were examined
     rows: HeldRows  # to be handed over to the folder by then
@@ -277,7 +277,7 @@ def examining(
     opened: Trajectory, asked: tuple[Rule, ...], between: tuple[str, str] | None, window: int,
     live: bool = False, hydrogens: bool | None = None, **keep: Unpack[Keep],
 ) -> Iterator[FrameExamination]:  # fmt: skip
-    """Context manager: make an output folder and examine frames; for the arguments, see `flips`.
+    """Context manager: make an output folder and examine frames (see `flips`).
 
     Args:
         live: whether frames come from a running program. Frame numbers are then time steps, with no decisions
@@ -360,7 +360,7 @@ def rules(
     nearest: int | Sequence[int] = (),
     most: int | None = None,
 ) -> tuple[Rule, ...]:
-    """Return the rules that define neighbors: cutoffs, cutoffs by pair of species, or nearest neighbors.
+    """Return the rules that define neighbors.
 
     Raises:
         InputError: a value is not a valid rule, a rule is repeated, or `most` is given without a cutoff.
@@ -385,7 +385,7 @@ def rules(
 
 
 def _listed(given: Any) -> tuple[Any, ...]:
-    """Return a tuple of the given values; a single value becomes a tuple of one."""
+    """Return a tuple of the given values. A single value becomes a tuple of one."""
     return (given,) if isinstance(given, str | Real | Mapping) else tuple(given)
 
 
@@ -414,7 +414,7 @@ def _species_cutoffs(words: _Pairs) -> Mapping[Any, float]:
 
 
 def _default_rules(trajectory: Trajectory) -> tuple[Rule, ...]:
-    """Return the cutoff of the mdnum run that wrote the trajectory, from the folder of the run."""
+    """Return the cutoff of the mdnum run that wrote the trajectory."""
     radius = None
     # no run of mdnum's
     with suppress(OSError, MdnumError, AttributeError):
@@ -428,7 +428,7 @@ def _default_rules(trajectory: Trajectory) -> tuple[Rule, ...]:
 
 
 def _refuse_topology_first(first: str | Path, second: str | Path, topology: str | Path | None) -> None:
-    """Raise an error if the topology is given before the trajectory, as other programs require."""
+    """Raise an error if the topology is given before the trajectory."""
     from mdnum.trajectories.readers import IN_MEMORY, open_trajectory
 
     for one in (first, second):
@@ -453,7 +453,7 @@ def _refuse_topology_first(first: str | Path, second: str | Path, topology: str 
 def _with_other_box(
     trajectory: Trajectory, frame: Any, found: Pass, of: Groups | ByResidue
 ) -> dict[str, Any] | None:
-    """Count the neighbor pairs of a frame in another plausible box; None if no other box is plausible."""
+    """Count the neighbor pairs of a frame in another plausible box. None if there is no such box."""
     from mdnum.trajectories.tracker import Tracker
 
     if (other := trajectory.other_box(frame.index)) is None:
@@ -470,7 +470,7 @@ def _with_other_box(
 
 
 def _cut_short(error: InputError | None, trajectory: Trajectory) -> bool:
-    """True if reading stopped at an incomplete frame that is probably the last one in the file."""
+    """True if reading stopped at an incomplete last frame."""
     from mdnum.reading import UnreadableFrame
 
     if not isinstance(error, UnreadableFrame):
@@ -506,7 +506,7 @@ def _steps(frames: Mapping[str, np.ndarray], trajectory: Trajectory) -> dict[str
 
 
 def _missing(numbers: np.ndarray, times: np.ndarray) -> dict[str, Any] | None:
-    """Find missing frames from gaps in time; None if intervals are not multiples of the usual interval."""
+    """Find missing frames from gaps in time. None if times are not regular."""
     steps = np.diff(times)
     usual = float(np.median(steps)) if len(steps) else 0.0
     ratio = steps / usual if usual > 0 else np.ones_like(steps)
@@ -524,10 +524,10 @@ def _missing(numbers: np.ndarray, times: np.ndarray) -> dict[str, Any] | None:
 
 
 def histories(folder: RunFolder, rule: int, frames: int) -> Iterator[tuple[int, int, History]]:
-    """Yield the flips of one neighbor rule in blocks, sorted by atom pair: (block, number of blocks, flips).
+    """Yield the flips of one rule, sorted by atom pair, as (block, number of blocks, flips).
 
-    The table of flips is ordered by frame and may be larger than memory. Each block contains all flips of
-    some atom pairs. The table is read once for each group of blocks that fits into memory.
+    The table of flips is sorted by frame and may be larger than memory. Each block contains all flips of some
+    atom pairs. The table is read once for each group of blocks that fits into memory.
     """
     from mdnum.trajectories.history import History
 
@@ -569,7 +569,7 @@ def _rule_told(
     motion: FrameMotion | None,
     log: Progress,
 ) -> dict[str, Any]:
-    """Return statistics of the flips of one neighbor rule, and write tables to the output folder."""
+    """Return statistics of the flips of one neighbor rule. Write tables to the output folder."""
     from mdnum.trajectories.residues import Occupancy, contacts_over_time
     from mdnum.trajectories.statistics import Labels, Statistics
 
@@ -648,7 +648,7 @@ def _rule_told(
 def _counted(
     total: Statistics, motion: FrameMotion | None, flux: Mapping[str, Any] | None, reach: float | None
 ) -> dict[str, Any]:
-    """Return contact statistics (plain values, times in frames); with `reach`, also estimate missed flips."""
+    """Return contact statistics with times in frames. With `reach`, also estimate missed flips."""
     from mdnum.trajectories.lost import lost_flips
     from mdnum.trajectories.statistics import Lifetime
 
@@ -675,9 +675,9 @@ def _counted(
 
 
 def _words(table: AtomTable, atoms: np.ndarray) -> list[str]:
-    """Return names of atoms, such as "GLY 12 CA" ("CA" if there are no residues), or of residues ("GLY 12").
+    """Return names of atoms, such as "GLY 12 CA" or "CA", or of residues ("GLY 12").
 
-    If there are several segments, each name begins with the name of the segment: "A GLY 12".
+    If there are several segments, a name begins with its segment: "A GLY 12".
     """
     several = len(set(table.segments.tolist())) > 1
     columns = (table.segments, table.residue_names, table.residue_ids, table.names)
@@ -689,7 +689,7 @@ def _words(table: AtomTable, atoms: np.ndarray) -> list[str]:
 
 
 def _as_asked(row: dict[str, Any], classes: Classes, groups: Groups) -> dict[str, Any]:
-    """Swap the two atom classes in a table row, if this makes them match the order of the two selections."""
+    """Swap the two atom classes in a table row if they are not in the order of the two selections."""
     if groups[0] is None or groups[1] is None:
         return row
     first, second = ({classes.names[at] for at in np.unique(classes.of[group])} for group in groups)
@@ -700,7 +700,7 @@ def _as_asked(row: dict[str, Any], classes: Classes, groups: Groups) -> dict[str
 
 
 def _flux(one: Followed, flips: int, steps: Mapping[str, Any], found: Pass) -> dict[str, Any] | None:
-    """Estimate the rate of cutoff crossings from velocities, and compare it with the observed flip rate."""
+    """Estimate the rate of cutoff crossings from velocities. Compare it with the observed flip rate."""
     duration = steps["last_time"] - steps["first_time"]
     if not one.flux or not steps["timed"] or not duration > 0 or found.odd is not None:
         return None

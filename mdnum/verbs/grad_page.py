@@ -1,4 +1,4 @@
-"""Report page of `mdnum grad`: derivatives by each method, rounded to their valid digits, and figures."""
+"""Report page of `mdnum grad`: derivatives with their valid digits, and figures."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ _GROWN = {"forward bounded, gradient not": "growing", "forward not bounded": "un
 
 
 def by(summary: Mapping[str, Any], method: str) -> Mapping[str, Any] | None:
-    """Return the stored result of a gradient method, or of the closed form that serves as the reference."""
+    """Return the stored result of a gradient method, or of the closed form."""
     if summary.get("exact") and method == summary["reference"]:
         exact = {"gradient": summary["exact"], "details": {}, "error": {}}
         return {"method": method, "description": TEXTS("exact"), **exact}
@@ -39,7 +39,7 @@ def by(summary: Mapping[str, Any], method: str) -> Mapping[str, Any] | None:
 
 
 def magnitude(value: Any, missing: float | None = None) -> float:
-    """Return a derivative as one number: a scalar's value, or the norm of an array."""
+    """Return a derivative as one number: a scalar, or the norm of an array."""
     if isinstance(value, Mapping):
         value = value["norm"]
     if isinstance(value, list):
@@ -48,12 +48,12 @@ def magnitude(value: Any, missing: float | None = None) -> float:
 
 
 def digits_of(summary: Mapping[str, Any], name: str) -> int | None:
-    """Return how many digits of a derivative stay the same if the time step is halved; None if unknown."""
+    """Return how many digits of a derivative stay the same with half the time step. None if unknown."""
     return ((summary.get("trust") or {}).get("digits") or {}).get(name)
 
 
 def digits_note(summary: Mapping[str, Any], name: str) -> str:
-    """Return a note if no digits of a derivative are valid or the valid digits are unknown; otherwise ""."""
+    """Return a note if no digits of a derivative are valid, or if their number is unknown."""
     known = digits_of(summary, name)
     if summary.get("trust") and known is None:
         return TEXTS("digits_unknown")
@@ -61,7 +61,7 @@ def digits_note(summary: Mapping[str, Any], name: str) -> str:
 
 
 def resolved(summary: Mapping[str, Any], name: str, value: float | None, most: int) -> str:
-    """Format one entry of a derivative, rounded to its valid digits but to at most `most` digits.
+    """Format one entry of a derivative with its valid digits, but at most `most` digits.
 
     Scientific notation is used if trailing zeros could be mistaken for valid digits.
     """
@@ -72,7 +72,7 @@ def resolved(summary: Mapping[str, Any], name: str, value: float | None, most: i
 
 
 def slope(summary: Mapping[str, Any], found: Mapping[str, Any] | None, name: str, most: int = 6) -> str:
-    """Format a derivative, rounded to its valid digits, with its error if the error is known."""
+    """Format a derivative with its valid digits, and with its error if known."""
     if found is None or name not in found["gradient"]:
         return "–"
     value = found["gradient"][name]
@@ -86,7 +86,7 @@ def slope(summary: Mapping[str, Any], found: Mapping[str, Any] | None, name: str
 
 
 def slope_unit(summary: Mapping[str, Any], parameter: Mapping[str, Any]) -> str:
-    """Return the unit of a derivative: unit of the loss divided by unit of the parameter."""
+    """Return the unit of a derivative."""
     above, below = summary["loss"]["unit"], parameter["unit"]
     if above == below:
         return ""
@@ -111,7 +111,7 @@ def closeness(row: Mapping[str, Any]) -> str:
 
 
 def limit_sentence(summary: Mapping[str, Any], limit: Mapping[str, Any]) -> str:
-    """Return a sentence on one limit to the number of steps over which a gradient can be trusted."""
+    """Return a sentence on one limit to the steps over which a gradient can be trusted."""
     code = f"{limit['what']}_{limit['code']}".replace(" ", "_")
     values = {"horizon": limit["horizon"], **limit["values"]}
     first = values.get("first")
@@ -120,7 +120,7 @@ def limit_sentence(summary: Mapping[str, Any], limit: Mapping[str, Any]) -> str:
 
 
 def judgments(summary: Mapping[str, Any]) -> dict[tuple[str, ...], Mapping[str, Any]]:
-    """Group parameters whose derivatives have the same judgment; the key of a single group is empty."""
+    """Group parameters whose derivatives have the same judgment. A single group has an empty key."""
     trust = summary.get("trust")
     if not trust:
         return {}
@@ -135,7 +135,7 @@ def judgments(summary: Mapping[str, Any]) -> dict[tuple[str, ...], Mapping[str, 
 
 
 def trust_sentence(summary: Mapping[str, Any], names: tuple[str, ...], one: Mapping[str, Any]) -> str:
-    """Return the sentence on whether derivatives with respect to named parameters can be trusted."""
+    """Return a sentence on whether derivatives with respect to named parameters can be trusted."""
     free = [limit["what"] for limit in one["limits"] if limit["horizon"] is not None and not limit["reached"]]
     values = {"steps": summary["steps"], "horizon": one["horizon"], "limit": one["limited_by"]}
     text = TEXTS(f"trust_{one['verdict']}", free=", ".join(free) or "nothing", **values)
@@ -143,7 +143,7 @@ def trust_sentence(summary: Mapping[str, Any], names: tuple[str, ...], one: Mapp
 
 
 def trust_sentences(summary: Mapping[str, Any]) -> Iterator[str]:
-    """Yield sentences on whether derivatives can be trusted, up to which step, and for which reasons."""
+    """Yield sentences on whether derivatives can be trusted, up to which step, and why."""
     for names, one in judgments(summary).items():
         yield trust_sentence(summary, names, one)
         yield from (limit_sentence(summary, limit) for limit in one["limits"] if limit["reached"])
@@ -200,7 +200,7 @@ def _keys(view: View) -> Iterator[Key]:
 
 
 def _methods(view: View) -> Iterator[Any]:
-    """Yield tables of the derivatives by each method, with differences from the reference method."""
+    """Yield tables of the derivatives by each method."""
     summary, reference = view.summary, view.summary["reference"]
     rows = sorted(summary["methods"], key=lambda one: one["method"] != reference)
     exact = by(summary, reference)
@@ -269,7 +269,7 @@ def _horizons(view: View) -> Iterator[Any]:
 
 
 def _limits(view: View) -> Iterator[tuple[float, str]]:
-    """Yield the step from which each derivative cannot be trusted, and the reason as a label."""
+    """Yield the step from which a derivative cannot be trusted, and the reason."""
     for names, one in judgments(view.summary).items():
         if one["limited_by"]:
             yield one["horizon"], ", ".join([f"limit: {one['limited_by']}", *names])
@@ -346,7 +346,7 @@ def _flips(view: View) -> Iterator[Any]:
 
 
 def _browse(table: Mapping[str, np.ndarray]) -> Browse:
-    """Return a searchable table of the flips with the largest contributions to the gradient."""
+    """Return a searchable table of the flips that contribute most to the gradient."""
     with np.errstate(divide="ignore", invalid="ignore"):
         rows = {**table, "ratio": np.abs(table["margin"]) / table["bound"]}
     rows["rank"] = np.arange(1, len(rows["ratio"]) + 1)

@@ -145,7 +145,7 @@ def _of_trust(view: View) -> Iterator[Finding]:
 
 
 def _unknown(view: View, trust: Mapping[str, Any]) -> Iterator[str]:
-    """Yield names of sentences that tell the user which further tests of the derivative are possible."""
+    """Yield names of sentences on possible further tests of the derivative."""
     unseen = {one["what"] for one in trust["limits"] if one["horizon"] is None}
     aware = by(view.summary, "event-aware") is not None
     if any(one["what"] == "half the time step" for one in view.summary["left_out"]):
@@ -168,7 +168,7 @@ def _averaged(view: View) -> bool:
 
 
 def _of_flips(view: View) -> Iterator[Finding]:
-    """Yield findings on derivatives dominated by one or two flips, and on omitted grazing flips."""
+    """Yield findings on derivatives dominated by one or two flips, and on grazing flips."""
     section, totals = "Flips on the way", (view.summary.get("flips") or {}).get("total") or {}
     table = view.table("flip_contributions") if totals else {}
     for name, total in totals.items():
@@ -199,7 +199,7 @@ def _of_flips(view: View) -> Iterator[Finding]:
 
 
 def _of_the_motion(view: View) -> Iterator[Finding]:
-    """Yield a finding on methods that disagree with the exact derivative, if a closed form is known."""
+    """Yield a finding on methods that disagree with a known exact derivative."""
     rows = view.summary["comparisons"] if view.summary.get("exact") else ()
     off = [row for row in rows if row["relative"] is None or row["relative"] > _CLOSE]
     methods: dict[str, list[str]] = {}

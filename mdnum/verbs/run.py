@@ -1,4 +1,4 @@
-"""`mdnum run`: simulate a system, store the results in a folder, compare with ASE and give a verdict."""
+"""`mdnum run`: simulate a system, and compare it with ASE."""
 
 from __future__ import annotations
 
@@ -148,10 +148,10 @@ def run(
 
 
 def _compile_beside() -> None:
-    """If the compilation cache is empty, start a second process that compiles the simulation's functions.
+    """If the compilation cache is empty, compile the simulation's functions in a second process.
 
-    After an installation, the cache is empty, and the first command spends most of its time on compilation. A
-    single process compiles on one processor only.
+    After an installation, the first command otherwise spends most of its time on compilation. A single
+    process compiles on one processor only.
     """
     kept = os.environ.get("JAX_COMPILATION_CACHE_DIR")
     with contextlib.suppress(OSError):
@@ -175,7 +175,7 @@ def _beside_the_loop(
     check: bool,
     report: bool,
 ) -> _Beside:
-    """Compare the first and last frame with ASE, in parallel with the simulation loop."""
+    """Compare the first and last frame with ASE during the simulation."""
     if report:
         import mdnum.report.drawing  # noqa: F401 it takes as long
     if not check:
@@ -211,7 +211,7 @@ def _beside_the_loop(
 
 
 def _keep(run: RunView, compared: EnergyReport | None, period: float | None, function: Any) -> None:
-    """Add the results that were computed in parallel with the simulation loop to summary.json."""
+    """Add the results of parallel computations to summary.json."""
     from mdnum.verbs.check import energy_findings
 
     assert compared is not None
@@ -224,7 +224,7 @@ def _keep(run: RunView, compared: EnergyReport | None, period: float | None, fun
 
 
 def _beside_float64(run: RunView, result: RunResult) -> None:
-    """For a fixed-point run, add the energy fluctuations of the run and of a float64 run to the summary."""
+    """Add the energy fluctuations of a fixed-point run and of a float64 run to the summary."""
     from mdnum.rollout.engine import FAILURES, Engine
 
     simulation, summary = result.simulation, run.summary
@@ -247,7 +247,7 @@ def _beside_float64(run: RunView, result: RunResult) -> None:
 
 
 def judge(run: RunView) -> Verdict:
-    """Return the verdict on a run, with findings ordered by cause, the most serious cause first."""
+    """Return the verdict on a run. The most serious cause comes first."""
     found = [
         *_status(run), *_time_step(run), *_lists(run), *_ledger(run), *_energy(run), *_ase(run),
         *_decisions(run), *_drift(run), *_cutoff(run),
@@ -439,7 +439,7 @@ def _loop(run: RunView) -> Iterator[Finding]:
 
 
 def function_findings(function: Mapping[str, Any] | None, units: Units) -> Iterator[Finding]:
-    """Yield findings on a user's pair function that is not finite, or has jumps in value or derivatives."""
+    """Yield findings on a user's pair function that is not finite or not smooth."""
     function = function or {}
     if function.get("single"):
         yield TEXTS.finding("SINGLE_INSIDE", "pair")

@@ -1,4 +1,4 @@
-"""Check slabs and wires: atoms must interact with periodic images along periodic axes only."""
+"""Check slabs and wires: atoms must interact with images along periodic axes only."""
 
 from __future__ import annotations
 
@@ -18,13 +18,13 @@ _SHORT = 1.3  # of the nearest distance: length of a free vector with which atom
 class PeriodicityCheck(InvarianceCheck):
     """Do atoms interact with their images along periodic axes, and only along periodic axes?
 
-    The test structures are a slab and a wire, with long, short, zero and skewed nonperiodic cell vectors.
+    The nonperiodic cell vectors are long, short, zero or skewed.
     """
 
     name, title, order, calls = "periodicity", "Mixed periodicity", 45, 250
 
     def ways(self, atoms: Atoms, given: Atoms, rng: np.random.Generator) -> Iterator[Same]:
-        """Yield many representations of a slab and of a wire made from the structure."""
+        """Yield representations of a slab and of a wire made from the structure."""
         axes = np.flatnonzero(atoms.pbc)
         if not len(axes) and len(atoms):  # a molecule that repeats along x
             apart = float(np.ptp(atoms.positions[:, 0])) + 1.2 * (nearest_distance(atoms) or 4.0)
@@ -35,7 +35,7 @@ class PeriodicityCheck(InvarianceCheck):
 
 
 def mixed(atoms: Atoms, periodic: np.ndarray, rng: np.random.Generator) -> Iterator[Same]:
-    """Yield a structure that is periodic along the given axes, with various cell vectors along the others."""
+    """Yield a structure that is periodic along the given axes, with various other cell vectors."""
     rows, axes = atoms.cell.array[periodic], np.flatnonzero(periodic)
     normals = np.linalg.svd(rows)[2][len(rows) :]
     extents = np.ptp(atoms.positions @ normals.T, axis=0)
@@ -69,7 +69,7 @@ def mixed(atoms: Atoms, periodic: np.ndarray, rng: np.random.Generator) -> Itera
 
 
 def _with(atoms: Atoms, periodic: np.ndarray, free: np.ndarray) -> Atoms:
-    """Return the structure with other cell vectors along nonperiodic axes, in a right-handed cell."""
+    """Return the structure with other cell vectors along nonperiodic axes."""
     cell = atoms.cell.array.copy()
     cell[~periodic] = free
     if np.linalg.det(cell) < 0:

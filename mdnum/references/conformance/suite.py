@@ -1,4 +1,4 @@
-"""Run the conformance suite on one neighbor list, and keep the first failure of each kind."""
+"""Run the conformance suite on a neighbor list. Keep the first failure of each kind."""
 
 from __future__ import annotations
 
@@ -50,7 +50,7 @@ _REFUSALS = 6  # refusals that are examined; a list with more kinds of them has 
 
 
 class Examiner:
-    """Finds out the conventions of a neighbor list, runs test cases, and checks the pairs that are returned.
+    """Runs test cases on a neighbor list, and checks the returned pairs.
 
     Args:
         reuse: use one object of the neighbor list for all test cases.
@@ -72,7 +72,7 @@ class Examiner:
             self._find_conventions()
 
     def _find_conventions(self) -> None:
-        """Determine from simple cases whether pairs are listed twice, and the signs of shifts and vectors."""
+        """Determine whether pairs are listed twice, and the signs of shifts and vectors."""
         tested, report = self.tested, self.report
         full, sign, toward = tested.full, 1, 1
         triple = once("a triple through a face", "few", [[0.2, 2, 2], [3.8, 2.1, 2], [0.5, 2.4, 2.2]], 4.0)
@@ -103,10 +103,10 @@ class Examiner:
             self._find_padding()
 
     def _find_padding(self) -> None:
-        """Determine whether an updatable list returns pairs beyond the cutoff, and up to which distance.
+        """Determine whether and how far an updatable list returns pairs beyond the cutoff.
 
-        The padding is the declared padding, or the distance by which the nearest missing pair exceeds the
-        cutoff.
+        The padding is the declared padding. Otherwise it is the distance of the nearest missing pair minus
+        the cutoff.
         """
         report = self.report
         crowd = replace(once("a crowd", "few", gas(*_CROWD), _CROWD[1]), skin=_SKIN)
@@ -137,7 +137,7 @@ class Examiner:
             report.padding = 1.0 if whole else (edge - crowd.r_cut) / _SKIN
 
     def unusable(self) -> str | None:
-        """Return the first error if every simple test case raised an exception or gave malformed pairs."""
+        """Return the first error if every simple test case failed."""
         reasons = [
             f"for the test case “{case.name}”, {'it raised ' * (why.code == 'RAISED')}{why.text}"
             for case, outcome in self.opening
@@ -146,11 +146,11 @@ class Examiner:
         return reasons[0] if reasons and len(reasons) == len(self.opening) else None
 
     def failures(self, case: Case) -> tuple[Failure, ...]:
-        """Return the errors at the first wrong call of a test case; none if a limit excludes the case."""
+        """Return the errors at the first wrong call of a test case. None if a limit excludes the case."""
         return () if self.tested.limits.refusal(case) is not None else self.ask(case).failures
 
     def ask(self, case: Case) -> CaseResult:
-        """Run a test case; an accidental exception is a failure, but a deliberate rejection is not."""
+        """Run a test case. An accidental exception is a failure, a deliberate rejection is not."""
         began = time.perf_counter()
         outcomes = self.session.ask(case)
         result = CaseResult(case.name, seconds=time.perf_counter() - began)
@@ -172,7 +172,7 @@ class Examiner:
         return result
 
     def take(self, case: Case, result: CaseResult) -> None:
-        """Record the result of a test case, and the smallest rejected test case of each kind."""
+        """Record the result of a test case. Keep the smallest rejected case of each kind."""
         self.report.take(case, result)
         if result.refused is not None:
             step, words = result.refused
@@ -184,7 +184,7 @@ class Examiner:
     def _judge(
         self, case: Case, step: int, answer: ListAnswer, how: Conventions
     ) -> tuple[list[Failure], tuple[float, float] | None, tuple[int, int]]:
-        """Return failures, the error of a list in float32 (else None), and numbers of pairs at r_cut."""
+        """Return failures, the error of a float32 list (or None), and numbers of pairs at r_cut."""
         reach = self.report.reach(case) if self.report.superset else None
         right = truth(case, step, reach=reach, unit=how.unit)
         found = judge(answer, right, how)
@@ -209,7 +209,7 @@ class Examiner:
 
 
 def _ties(answer: ListAnswer, right: Truth) -> tuple[int, int]:
-    """Return the numbers of listed and unlisted pairs exactly at r_cut, if all coordinates are integers."""
+    """Return the numbers of listed and unlisted pairs at r_cut. Both are 0 if coordinates are no integers."""
     numbers = np.concatenate([right.positions.ravel(), right.cell.ravel(), [right.r_cut]])
     if not ((numbers == np.rint(numbers)).all() and np.abs(numbers).max(initial=0.0) < 1e6):
         return 0, 0  # on small integers no arithmetic rounds
@@ -224,7 +224,7 @@ def _ties(answer: ListAnswer, right: Truth) -> tuple[int, int]:
 
 
 def _with_earlier(case: Case, step: int, right: Truth, reach: float) -> Truth:
-    """Return the correct pairs at a call, and those of earlier calls since the neighbor list was built."""
+    """Return the correct pairs at this call and at earlier calls since the list was built."""
     rows = [(right.i, right.j, right.shift)]
     for before in range(step - 1, -1, -1):
         if len(case.stills[before].positions) != len(right.positions) or case.stills[before + 1].fresh:
@@ -357,7 +357,7 @@ def examine(
 
 
 def _keeps_order(examiner: Examiner) -> bool | None:
-    """Return whether three identical calls return the same pairs in the same order; None if a call fails."""
+    """Return whether three identical calls return the same pairs in order. None if a call fails."""
     for case in (once("order", "reuse", gas(40, 6.0, 120), 6.0), once("order", "reuse", gas(40, 3.0, 120))):
         case = replace(case, skin=0.3 if examiner.tested.kept else 0.0)
         if examiner.tested.limits.refusal(case) is None:
@@ -368,7 +368,7 @@ def _keeps_order(examiner: Examiner) -> bool | None:
 
 
 def _too_long(report: Report, case: Case) -> str | None:
-    """Return the reason for skipping a large test case that would take too long, or None."""
+    """Return why a large test case would take too long, or None."""
     if report.large is None:
         return None
     atoms, seconds = report.large
@@ -378,9 +378,9 @@ def _too_long(report: Report, case: Case) -> str | None:
 
 
 def _refusals(examiner: Examiner) -> list[RefusalKind]:
-    """Return the kinds of rejected test cases, and variants of each that the neighbor list accepts.
+    """Return the kinds of rejected test cases, and the accepted variants of each.
 
-    Each variant of a test case is run in a new process, or with a new object.
+    Each variant runs in a new process, or with a new object.
     """
     found = []
     for refusal in list(examiner.refused.values())[:_REFUSALS]:
@@ -396,9 +396,9 @@ def _refusals(examiner: Examiner) -> list[RefusalKind]:
 
 
 def distinct(failed: Iterable[Failed]) -> list[Failed]:
-    """Return the smallest failure of each kind, since one error can cause failures in many test cases.
+    """Return the smallest failure of each kind. One error can cause many failures.
 
-    Failures with the same code and equal numbers of atoms, calls and periodic axes are counted as one error.
+    Failures with the same code and equal numbers of atoms, calls and periodic axes count as one error.
     Exceptions and malformed results count as one error if their messages differ only in numbers.
     """
 
