@@ -24,7 +24,7 @@ _missed: list[Any] = []  # what could not be kept
 
 
 def njit(function: Any = None, /, **options: Any) -> Any:
-    """`numba.njit` that releases Python's global lock and, if possible, caches compiled functions on disk."""
+    """`numba.njit` that releases Python's global lock. Compiled functions are cached on disk if possible."""
     if function is None:
         return lambda function: njit(function, **options)
     return _kept(lambda keep: numba.njit(cache=keep, nogil=True, **options)(function))
@@ -36,7 +36,7 @@ def cfunc(signature: Any, function: Callable[..., Any]) -> Any:
 
 
 def all_kept() -> bool:
-    """Return True if every function that this process has compiled so far is cached on disk."""
+    """Return True if every function compiled so far is cached on disk."""
     # a function that was not called has not been compiled
     return not any(getattr(one, "signatures", True) for one in _missed)
 
@@ -58,7 +58,7 @@ def _kept(compiled: Callable[[bool], Any]) -> Any:
 
 
 def _attempt(use: Callable[..., Any]) -> Callable[..., Any]:
-    """Wrap a method of numba's cache, so that errors from unreadable files or a full disk are recorded."""
+    """Wrap a method of numba's cache, to record errors from unreadable files or a full disk."""
 
     def attempt(*given: Any) -> Any:
         try:

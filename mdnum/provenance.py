@@ -1,8 +1,8 @@
 """Record of the software and the machine of a run, which helps to explain differences between runs.
 
 Two runs of the same system file and structure should agree bit for bit if their fingerprints agree. The
-fingerprint includes everything that affects code generation and arithmetic: versions, instruction set of the
-processor, devices, XLA's flags, jax's settings and dtypes.
+fingerprint includes versions, instruction sets and devices. It also includes XLA's flags, jax's settings and
+dtypes.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ class _System(Protocol):
 
 
 def collect(system: _System) -> dict[str, Any]:
-    """Return the software, hardware and settings on which a run depends, and hashes of the input.
+    """Return the software, hardware and settings on which a run depends, and hashes of its input.
 
     Returns:
         a mapping of plain values, ready for JSON.
@@ -103,12 +103,12 @@ def fingerprint(parts: Mapping[str, Any]) -> str:
 
 
 def package_versions() -> dict[str, str | None]:
-    """Return the versions of packages on which results can depend, with None for packages not installed."""
+    """Return the versions of packages on which results can depend. None means not installed."""
     return {package: version(package) for package in _RECORDED["packages"]}
 
 
 def version(package: str) -> str | None:
-    """Return the installed version of a package, or None if the package is not installed."""
+    """Return the installed version of a package, or None."""
     try:
         return importlib.metadata.version(package)
     except importlib.metadata.PackageNotFoundError:
@@ -121,7 +121,7 @@ def cores() -> int:
 
 
 def cpu(cpuinfo: Path = Path("/proc/cpuinfo")) -> dict[str, Any]:
-    """Return the processor's name, number of cores, and the instruction sets that affect rounding.
+    """Return the processor's name, number of cores, and instruction sets that affect rounding.
 
     Args:
         cpuinfo: Linux's description of the processor; other systems use Python's `platform`.
@@ -144,10 +144,10 @@ def cpu(cpuinfo: Path = Path("/proc/cpuinfo")) -> dict[str, Any]:
 
 
 def hashes(system: _System) -> dict[str, str | None]:
-    """Return SHA-256 digests of the system file, of the settings that it defines, and of the structure.
+    """Return SHA-256 digests of the system file, of its settings, and of the structure.
 
     The settings are all parameters except the structure, with defaults and overrides. The hash of the
-    settings changes with every value, but not with the system's name. The structure is hashed as numbers
+    settings depends on every value, but not on the system's name. The structure is hashed as numbers
     (species, masses, positions, velocities, cell, periodicity). The same atoms in another file format
     therefore have the same hash.
 
@@ -176,9 +176,9 @@ def hashes(system: _System) -> dict[str, str | None]:
 
 
 def commit(package: Path) -> str | None:
-    """Return the git commit of a package's source, with "+" if source files were changed since the commit.
+    """Return the git commit of a package's source, with "+" if source files have changed.
 
-    Programs that a git repository can configure (monitors, hooks, filters, transports) are not run.
+    Programs that a git repository can configure (monitors, hooks, filters) are not run.
 
     Returns:
         None for an installed wheel, without git, or if the folder belongs to another repository.

@@ -1,16 +1,15 @@
-"""The linearized run: how a small perturbation of the start grows, and which decisions this growth changes.
+"""The linearized run: how a small perturbation grows, and which decisions it changes.
 
-The tangent (the derivative of the state) is propagated along the recorded states, with the neighbor lists of
-the run. The reference trajectory is therefore the recorded run, bit for bit. The exponential growth rate of
-the tangent is the largest Lyapunov exponent. The tangent is rescaled repeatedly (Benettin, Galgani, Giorgilli
-and Strelcyn 1980) and, unlike the distance between two runs, does not saturate.
+The tangent (the derivative of the state) is propagated along the recorded states. The reference trajectory is
+therefore the recorded run, bit for bit. The exponential growth rate of the tangent is the largest Lyapunov
+exponent. It is rescaled repeatedly (Benettin, Galgani, Giorgilli and Strelcyn 1980). Unlike the distance
+between two runs, it does not saturate.
 
-Each decision has a margin m and a tangent dm/da, where a is the amplitude of the perturbation. To first
-order, the decision flips at a = -m / (dm/da). At each step, a perturbation below the smallest flip amplitude
-flips no decision. The prediction holds as long as the perturbed run remains close to the reference run and
-makes the same decisions. If the force jumps at the cutoff, the first flip changes the momenta of both atoms.
-The forecast ends at the first flip, because the linearization no longer describes the perturbed run. If the
-force is continuous at the cutoff, a flip does not change the motion to first order.
+Each decision has a margin m and a tangent dm/da for the amplitude a of the perturbation. To first order, the
+decision flips at a = -m / (dm/da). At each step, a perturbation below the smallest flip amplitude flips no
+decision. The prediction holds while the perturbed run stays close and makes the same decisions. If the force
+jumps at the cutoff, the first flip changes the momenta of both atoms. The forecast then ends at the first
+flip. If the force is continuous, a flip does not change the motion to first order.
 """
 
 from __future__ import annotations
@@ -52,7 +51,7 @@ _ULPS = 8.0
 
 @dataclass(frozen=True)
 class StepTangents:
-    """The tangent of a run during the time steps for which one neighbor list is used."""
+    """The tangent of a run during the steps with one neighbor list."""
 
     segment: Segment  # the steps
     # log of the length of the tangent (positions, and velocities times 30 time steps) at each step, relative
@@ -142,7 +141,7 @@ def _length(tangent, clock: float) -> float:
 
 
 def _labels(segment: Segment, slot: np.ndarray, amplitude: np.ndarray) -> np.ndarray:
-    """Return the atom pairs in given slots of the flattened neighbor list, or -1 for empty slots."""
+    """Return the atom pairs in given slots of the flattened neighbor list. Empty slots give -1."""
     order = segment.table.order
     row, column = np.divmod(slot, len(order))
     ends = np.stack([order[column], np.append(order, -1)[segment.table.index[row, column]]], axis=-1)
@@ -226,7 +225,7 @@ class Lyapunov:
 
     @property
     def rate_time(self) -> float:
-        """Lyapunov exponent per unit of time, in the time unit of the system file."""
+        """Lyapunov exponent per unit of time."""
         return self.rate / self.timestep
 
     @property
@@ -235,17 +234,17 @@ class Lyapunov:
         return self.error / self.timestep
 
     def ratio(self, seen: Growth) -> float:
-        """Divide the rate at which two runs diverge by the Lyapunov exponent; NaN if the run is not chaotic.
+        """Divide the rate at which two runs diverge by the Lyapunov exponent. NaN if the run is not chaotic.
 
-        Without flips, two runs diverge at the Lyapunov rate; faster divergence must be due to flips.
+        Without flips, two runs diverge at the Lyapunov rate. Faster divergence is due to flips.
         """
         return seen.rate / self.rate if self.chaotic else float("nan")
 
     def steps_to(self, start: float, end: float) -> float | None:
-        """Return the step at which a displacement has grown from an initial length to a given length.
+        """Return the step at which a displacement has grown from one length to another.
 
-        Displacement and tangent grow by the same factor during the run, and exponentially after the run. If
-        the run is not chaotic, the result is None if the displacement does not reach `end` during the run.
+        The displacement grows like the tangent during the run, and exponentially after it. The result is None
+        if a displacement without chaos does not reach `end` during the run.
 
         Args:
             start: largest displacement of an atom at the start, length; for example one rounding unit.
@@ -307,7 +306,7 @@ class PredictedFlip:
 
 
 class ForecastRange(NamedTuple):
-    """The last step of a valid forecast for one perturbation amplitude, and why the forecast ends there."""
+    """The last step of a valid forecast for one amplitude, and why the forecast ends there."""
 
     step: int  # the last one; -1 for none
     # why there: "end" of the run; "flip", the first one kicks its atoms; "close", whether a decision of the
@@ -318,7 +317,7 @@ class ForecastRange(NamedTuple):
 
 @result
 class Forecast:
-    """First-order prediction of the decisions flipped by perturbations of the start along one direction.
+    """First-order prediction of the decisions that a perturbation of the start flips.
 
     Error: second-order terms are neglected; rounding adds a few ulps. Flips that are uncertain within this
         error are not predicted. `good_until` returns the last step for which the forecast is valid.
@@ -347,11 +346,11 @@ class Forecast:
 
     @property
     def kicks(self) -> bool:
-        """True if the force jumps at a flip, so that the flip changes all subsequent motion."""
+        """True if the force jumps at a flip. The flip then changes all later motion."""
         return self.simulation.cutoff.smoothness < 1
 
     def good_until(self, amplitude: float) -> ForecastRange:
-        """Return the last step for which the forecast at an amplitude is valid, and why the forecast ends."""
+        """Return the last step of a valid forecast for an amplitude, and why the forecast ends."""
         listed = self._until(2 * abs(amplitude) * self.furthest > self.room)
         ends = ((self.steps, "end"), (self.linear_until(amplitude), "size"), (listed, "list"))
         last = min((ForecastRange(*end) for end in ends), key=lambda one: one.step)
@@ -366,9 +365,9 @@ class Forecast:
         return last
 
     def first(self, amplitude: float, count: int = 3) -> tuple[PredictedFlip, ...]:
-        """Predict which decisions a perturbation flips first, by time step, while the forecast is valid.
+        """Predict which decisions a perturbation flips first, while the forecast is valid.
 
-        At most `KEPT` flips per step are listed; if `KEPT` flips are listed, the step may have more flips.
+        At most `KEPT` flips per step are listed. A step with `KEPT` flips may have more.
 
         Args:
             amplitude: amplitude of the perturbation; its sign matters.
@@ -383,10 +382,10 @@ class Forecast:
         return _each_pair_once(flips, count)
 
     def nearest(self, count: int = 10) -> tuple[PredictedFlip, ...]:
-        """Return the predicted flips of smallest positive or negative amplitude, one for each pair of atoms.
+        """Return the predicted flips of smallest positive or negative amplitude, one for each pair.
 
-        A flip is included only if the forecast is valid up to the step of the flip. If the force jumps at the
-        cutoff, only the first flip can be predicted.
+        A flip is included only if the forecast is valid up to its step. If the force jumps at the cutoff,
+        only the first flip can be predicted.
         """
         # where flips kick, only what flips sooner or at less than all before it can be the first
         least = np.minimum.accumulate(self.reach.min(axis=2), axis=1)
@@ -400,14 +399,14 @@ class Forecast:
         return _each_pair_once(good, count)
 
     def linear_until(self, amplitude: float) -> int:
-        """Return the last step at which a perturbation is expected to be small enough for a forecast."""
+        """Return the last step at which a perturbation is small enough for a forecast."""
         return self._until(abs(amplitude) * self.furthest > LINEAR * self.simulation.r_cut)
 
     def _until(self, beyond: Bool[np.ndarray, "rows"]) -> int:
         return int(beyond.argmax()) - 1 if beyond.any() else self.steps
 
     def _error(self, amplitude: float) -> Float[np.ndarray, "rows"]:
-        """Estimate, for each step, the relative error of the predicted amplitude of a flip."""
+        """Estimate the relative error of a flip's predicted amplitude at each step."""
         size = abs(amplitude)
         with np.errstate(divide="ignore", over="ignore"):
             return _SECOND_ORDER * size * self.furthest / self.simulation.r_cut + _ULPS * self.ulp / size
@@ -438,7 +437,7 @@ def forecast(
     *,
     seed: int = 0,
 ) -> Forecast:
-    """Predict the flips caused by a perturbation of the start in a given direction.
+    """Predict the flips caused by a perturbation of the start.
 
     Args:
         simulation: a simulation with a pair potential.
@@ -471,6 +470,6 @@ def forecast(
 
 
 def direction(simulation: Simulation, seed: int) -> Float[np.ndarray, "atoms 3"]:
-    """Return random displacements of all atoms, scaled so that the longest displacement has length 1."""
+    """Return random displacements of all atoms. The longest has length 1."""
     noise = np.random.default_rng(seed).standard_normal(simulation.positions.shape)
     return noise / np.sqrt((noise**2).sum(axis=1)).max()

@@ -1,4 +1,4 @@
-"""Analysis of functions traced by jax: single-precision operations, and the origin of non-finite numbers."""
+"""Analysis of functions traced by jax: float32 operations, and the origin of non-finite numbers."""
 
 from __future__ import annotations
 
@@ -42,15 +42,15 @@ def narrows(closed: Any) -> bool:
 
 
 def held_numbers(closed: Any, least: int = 10) -> int:
-    """Count the entries of large constant arrays in a jaxpr, such as model weights captured by a function."""
+    """Count the entries of large constant arrays in a jaxpr, such as model weights."""
     consts = [one for program in _programs(closed) for one in getattr(program, "consts", ())]
     return sum({id(one): one.size for one in consts if is_inexact(one) and one.size >= least}.values())
 
 
 def single_numbers(closed: Any) -> list[str]:
-    """Return the constants of a jaxpr that were rounded to float32, each as a short decimal number.
+    """Return the constants of a jaxpr that were rounded to float32, as short decimal numbers.
 
-    A constant that was rounded to float32 can be written with fewer digits than other float64 numbers.
+    Such constants have fewer digits than other float64 numbers.
     """
     numbers: dict[str, None] = {}
     for program in _programs(closed):
@@ -83,7 +83,7 @@ class Operation:
 
 
 def first_not_finite(function: Callable[..., Any], *args: Any) -> Operation | None:
-    """Find the operation that first makes the result of a function infinite or NaN, without compilation.
+    """Find the operation that first makes the result of a function infinite or NaN.
 
     Returns:
         the operation; None if all results are finite, or if an argument is not finite.
@@ -116,13 +116,13 @@ def count_bad(tree: Any) -> int:
 
 
 def is_inexact(leaf: Any) -> bool:
-    """Return whether an object is an array of floats, including the 8-bit and 16-bit types of ml_dtypes."""
+    """Return whether an object is an array of floats, including ml_dtypes' small types."""
     return jnp.issubdtype(getattr(leaf, "dtype", np.int64), jnp.floating)
 
 
 @dataclass
 class _Interpreter:
-    """Interpreter that runs a jaxpr one operation at a time, and finds results that are not finite."""
+    """Interpreter that runs a jaxpr one operation at a time. It finds results that are not finite."""
 
     mended: list[int]  # numbers of operations whose results are made finite
     found: Operation | None = None  # the first operation at fault
@@ -199,7 +199,7 @@ class _Interpreter:
 
 
 def _written(equation: Any) -> tuple[str, tuple[str, ...]]:
-    """Return the source location of an operation, and the calls that lead to it, outermost first."""
+    """Return the source location of an operation, and the calls that lead to it."""
     traceback, inside = equation.source_info.traceback, f"{Path(jax.__file__).parent}/"
     frames = [
         one

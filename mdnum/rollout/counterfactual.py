@@ -1,4 +1,4 @@
-"""Counterfactual runs: runs with their own arithmetic, but with the cutoff decisions of another run."""
+"""Counterfactual runs: their own arithmetic, but the cutoff decisions of another run."""
 
 from __future__ import annotations
 
@@ -22,10 +22,10 @@ from mdnum.systems.simulation import Simulation
 
 
 class Counterfactual:
-    """A run with its own arithmetic, on which the cutoff decisions of another run (the leader) are imposed.
+    """A run with its own arithmetic and the cutoff decisions of another run (the leader).
 
-    The run's own decisions are also computed, and those that differ from the leader's are counted. The object
-    is called with each segment of the leader's run. The method `until` returns the simulated time steps.
+    Its own decisions are also computed, and differences from the leader's are counted. The object is called
+    with each segment of the leader's run. The method `until` returns the simulated time steps.
 
     Args:
         simulation: the run whose arithmetic is used.
@@ -70,7 +70,7 @@ class Counterfactual:
         self._record: EpochRecord | None = None
 
     def __call__(self, segment: Segment) -> None:
-        """Simulate the steps of a leader's segment with the leader's decisions, and store the results."""
+        """Simulate the steps of a segment with the leader's decisions, and store the results."""
         if self._over:
             return
         rows = self.follow(segment)
@@ -82,11 +82,11 @@ class Counterfactual:
             self._ahead.append(rows)
 
     def until(self, last: int) -> Rows | None:
-        """Return simulated time steps up to `last` that have not been returned yet; None if none are left."""
+        """Return new simulated steps up to `last`, or None if none are left."""
         return taken(self._ahead, last)
 
     def follow(self, segment: Segment) -> Rows:
-        """Simulate the steps of a leader's segment with the leader's decisions, and return the results."""
+        """Simulate the steps of a segment with the leader's decisions, and return the results."""
         parts: list[Rows] = []
         row = 0
         while row < segment.rows and not self.failed:
@@ -145,7 +145,7 @@ class Counterfactual:
         return tuple(leaves), structure
 
     def _list(self, segment: Segment):
-        """Return this run's neighbor list, and the position of each listed pair in the leader's list."""
+        """Return this run's neighbor list, and the position of its pairs in the leader's list."""
         simulation = self.simulation
         if self._own is None:
             home, cell = self.state.x, jax.tree.map(np.asarray, self.state.cells[0])
@@ -160,7 +160,7 @@ class Counterfactual:
 
 
 def _by_species(simulation: Simulation) -> Float[np.ndarray, "channels species species"]:
-    """Return the cutoff radius (length) for each pair of species and each group of potential terms."""
+    """Return the cutoff radius (length) for each pair of species and group of terms."""
     radii = np.array(simulation.decider.r_cut).reshape(simulation.channels, -1)
     count = len(simulation.symbols)
     if radii.shape[1] == 1:
@@ -172,7 +172,7 @@ def _by_species(simulation: Simulation) -> Float[np.ndarray, "channels species s
 def _places(
     table: PairTable, led: PairTable, labels: Int[np.ndarray, "atoms"]
 ) -> Int[np.ndarray, "slots atoms"]:
-    """Return, for each entry of a neighbor list, the position of the same pair in another list."""
+    """Return the position of each pair of a neighbor list in another list."""
     atoms = len(labels)
     slot, column = np.nonzero(led.index < atoms)
     keys = led.order[column].astype(np.int64) * atoms + led.order[led.index[slot, column]]
@@ -190,7 +190,7 @@ def _places(
 def _mapped(
     bits: UInt8[Array, "rows words atoms"], place: Int[Array, "slots atoms"], channels: int = 1
 ) -> UInt8[Array, "rows own atoms"]:
-    """Rearrange packed decisions from the order of one neighbor list to the order of another list."""
+    """Rearrange packed decisions from the order of one neighbor list to that of another."""
     rows, _, atoms = bits.shape
     shift = jnp.arange(8, dtype=jnp.uint8)[None, None, :, None]
     each = ((bits[:, :, None, :] >> shift) & jnp.uint8(1)).reshape(rows * channels, -1)

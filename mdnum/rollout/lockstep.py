@@ -1,8 +1,8 @@
-"""Simultaneous simulation of two runs, and of each run with the cutoff decisions of the other run imposed.
+"""Simultaneous simulation of two runs, and of each run with the other's cutoff decisions.
 
-Without imposed decisions, each run gives bit for bit the results of a single run, because neighbor lists and
-compiled loops are separate. The comparison of the two runs uses only changes of cutoff decisions. The cost of
-this comparison does not depend on the number of pairs; only pairs with different decisions are stored.
+Each run without imposed decisions equals a single run bit for bit. Neighbor lists and compiled loops are
+separate. The comparison of the two runs uses only changes of cutoff decisions. Only pairs with different
+decisions are stored.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from mdnum.systems.simulation import Simulation
 
 
 def lockstep(leader: Track, follower: Track, imposed: Mapping[str, Counterfactual]) -> Iterator[PairRows]:
-    """Advance two runs, and copies of these runs with imposed decisions, in groups of time steps.
+    """Advance two runs, and copies with imposed decisions, in groups of steps.
 
     Args:
         leader, follower: the runs A and B; the counterfactual with the decisions of a run is its listener.
@@ -86,16 +86,16 @@ def lockstep(leader: Track, follower: Track, imposed: Mapping[str, Counterfactua
 def beside(
     leader: Track, runs: Sequence[Track | Counterfactual]
 ) -> Iterator[list[Float[np.ndarray, "rows"]]]:
-    """Yield, for each run and step, the largest distance of an atom from its position in `leader`."""
+    """Yield the largest distance of an atom from its position in `leader`, for each run and step."""
     while leader.segment() is not None:
         rows = leader.until(end := leader.ready)
         yield [separation_of(rows, run.until(end)) for run in runs]
 
 
 def separation_of(a: Rows | None, b: Rows | None) -> Float[np.ndarray, "rows"]:
-    """Return each step's largest distance between an atom's positions in two runs; NaN if run b has ended.
+    """Return each step's largest distance between an atom's positions in two runs. NaN after run b has ended.
 
-    Positions are scaled to the box of the first run, and distances are minimum-image distances in this box.
+    Positions are scaled to the box of the first run. Distances are minimum-image distances in this box.
     """
     out = np.full(0 if a is None else len(a), np.nan)
     if a is not None and b is not None:
@@ -106,7 +106,7 @@ def separation_of(a: Rows | None, b: Rows | None) -> Float[np.ndarray, "rows"]:
 
 
 def strain_of(a: Rows, b: Rows | None) -> Float[np.ndarray, "rows"]:
-    """Return the strain between the boxes of two runs at each step, and NaN after run b has ended."""
+    """Return the strain between the boxes of two runs at each step. NaN after run b has ended."""
     out = np.full(len(a), np.nan)
     if b is not None:
         rows = min(len(a), len(b))
@@ -139,7 +139,7 @@ def _per_row(doubts: AmbiguousPairs, rows: Rows) -> Int[np.ndarray, "rows"]:
 
 
 def _nearest(run: Simulation, rows: Rows | None, clock: Rows) -> Float[np.ndarray, "rows"]:
-    """Return, for each step, a lower bound on |pair distance - cutoff radius| over all pairs."""
+    """Return a lower bound on |pair distance - cutoff radius| at each step."""
     if rows is None or rows.nearest is None:
         return np.full(len(clock), np.nan)
     margin = rows.nearest
@@ -154,7 +154,7 @@ def _nearest(run: Simulation, rows: Rows | None, clock: Rows) -> Float[np.ndarra
 
 
 def _bound(track: Track, rows: Rows | None) -> Float[np.ndarray, "rows"]:
-    """Return, for each step of a run, the largest bound on the rounding error of a pair distance."""
+    """Return the largest bound on the rounding error of a pair distance at each step."""
     if rows is None:
         return np.zeros(0)
     decider = track.simulation.decider

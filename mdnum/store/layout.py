@@ -1,4 +1,4 @@
-"""Layout of a run folder: declared by the command that creates the folder, and stored in the manifest."""
+"""Layout of a run folder. A command declares it, and the manifest stores it."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ _MOST_TABLES, _MOST_COLUMNS = 100, 1000
 
 @dataclass(frozen=True)
 class Layout:
-    """Layout of a kind of run folder: its command, the file from which it is resumed, and its tables.
+    """Layout of a run folder: its command, its tables, and the file from which it is resumed.
 
     Args:
         kind: name of the kind.
@@ -81,12 +81,12 @@ class Layout:
         return tuple(name for name in self.tables if not name.endswith("?"))
 
     def keeps(self, name: str) -> bool:
-        """Return True if a file other than a table belongs to the layout, so that its digest is checked."""
+        """Return True if a file other than a table belongs to the layout. Its digest is then checked."""
         fixed = ("summary.json", self.resumes_from)
         return name in fixed or any(fnmatchcase(name, pattern) for pattern in self.further.split())
 
     def columns(self, table: str) -> Mapping[str, tuple[str, bool]]:
-        """Return the type of each column of a table, and whether values can be null (empty if undeclared)."""
+        """Return the type of each column of a table, and whether values can be null."""
         return self._columns.get(table, {})
 
     @cached_property
@@ -104,7 +104,7 @@ class Layout:
 
     @property
     def spelled(self) -> dict[str, str]:
-        """Declared tables with the types of all columns, in the format of the manifest."""
+        """Declared tables with their column types, in the format of the manifest."""
         spelled = {}
         for table in self.tables:
             columns = self.columns(table.rstrip("?")).items()

@@ -1,4 +1,4 @@
-"""Search for the cheapest setting whose results agree with converged results within a tolerance."""
+"""Search for the cheapest setting whose results agree with converged results."""
 
 from __future__ import annotations
 
@@ -25,33 +25,33 @@ _ENDS = {
 
 @dataclass(frozen=True)
 class EndComparison:
-    """Comparison of one value of a choice, or of a whole setting, with converged results."""
+    """Comparison of one value of a choice, or of a setting, with converged results."""
 
     value: Any
     by_measure: Mapping[str, Within]
 
     @property
     def worst(self) -> str | None:
-        """A measure outside its tolerance; otherwise the undecided measure that needs the most seeds."""
+        """A measure outside its tolerance, or else the undecided one that needs the most seeds."""
         each = self.by_measure
         ranked = sorted(each, key=lambda name: (each[name].inside is not False, -each[name].more))
         return next((name for name in ranked if each[name].inside is not True), None)
 
     @property
     def inside(self) -> bool | None:
-        """True if all measures are within tolerance, False if one is not, None if this cannot be decided."""
+        """True if all measures are within tolerance, False if one is not, None if undecided."""
         each = [one.inside for one in self.by_measure.values()]
         return False if False in each else None if None in each else True
 
     @property
     def more(self) -> float:
-        """Factor by which to increase the number of seeds so that every comparison can be decided."""
+        """Factor by which the number of seeds must grow to decide every comparison."""
         return max((one.more for one in self.by_measure.values()), default=1.0)
 
 
 @dataclass(frozen=True)
 class Advice:
-    """Recommended value of one axis (a varied choice), with the comparisons that lead to this value.
+    """Recommended value of one axis (a varied choice), with its comparisons.
 
     Attributes:
         key: key of the axis. end: the value that is regarded as converged; None if there is none.
@@ -72,7 +72,7 @@ class Advice:
 
 
 def end_of(key: str, values: Sequence[Any], given: Mapping[str, str] = {}) -> Any:
-    """Return the value of an axis (a varied choice) that is regarded as converged, or None if none is."""
+    """Return the value of an axis that counts as converged, or None."""
     word = given.get(key, _ENDS.get(key) or _ENDS.get(key.rpartition(".")[2], ""))
     if word == "largest":
         return max(values, key=_size)
@@ -92,7 +92,7 @@ def advise(
     tolerances: Mapping[str, float],
     given: Mapping[str, str] = {},
 ) -> Advice | None:
-    """Return the recommended value of an axis (a varied choice), or None if none can be recommended.
+    """Return the recommended value of an axis, or None.
 
     Args:
         values: values of the axis.
@@ -125,7 +125,7 @@ def compared_with_end(
     tolerances: Mapping[str, float],
     comparisons: int,
 ) -> EndComparison:
-    """Compare results for one value of a choice, or for a whole setting, with the converged results.
+    """Compare results for one value of a choice, or for a setting, with converged results.
 
     Args:
         key: its label in `found`. found, tolerances: as for `advise`. comparisons: their number.

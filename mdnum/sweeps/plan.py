@@ -1,4 +1,4 @@
-"""Plan of a sweep, made before any run: settings, points, and the address of each point on disk."""
+"""Plan of a sweep, made before any run: settings, points and folders."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ Setting = tuple[str, ...]
 
 @dataclass(frozen=True)
 class Question:
-    """Arguments of a sweep; names and meanings are those of the arguments of `mdnum.sweep`."""
+    """Arguments of a sweep; see `mdnum.sweep`."""
 
     seeds: int | Sequence[int] = 4
     measure: Sequence[str] | str = USUAL["md"]
@@ -38,7 +38,7 @@ class Question:
 
 @dataclass(frozen=True)
 class Planned:
-    """A point of a sweep, with the data that define it and its address on disk."""
+    """A point of a sweep, with its address on disk."""
 
     point: Point
     setting: Setting
@@ -80,20 +80,20 @@ class Plan:
 
     @property
     def wanted(self) -> dict[str, str]:
-        """Digest of the source files of each measure, by the measure's name, as stored with results."""
+        """Digest of the source files of each measure, as stored with results."""
         return {measure.name: measure.digest for measure in self.measures}
 
     @property
     def origin(self) -> Setting:
-        """The setting in which every choice has the value that the system file gives."""
+        """The setting in which every choice has the value of the system file."""
         return self.setting(self.base)
 
     def setting(self, choices: Mapping[str, Any]) -> Setting:
-        """Return a setting as a tuple of labels, which are the formatted values of all varied choices."""
+        """Return a setting as a tuple of labels: the formatted values of all varied choices."""
         return tuple(label(choices[axis.key]) for axis in self.axes)
 
     def along(self, axis: Axis) -> Iterator[tuple[Any, Setting]]:
-        """Yield (value, setting) for each value of one choice; other choices keep their base values."""
+        """Yield (value, setting) for each value of one choice. Other choices keep their base values."""
         for value in axis.values:
             yield value, self.setting({**self.base, axis.key: value})
 
@@ -181,7 +181,7 @@ def planned(system: Any, over: Any, question: Question, overrides: Mapping[str, 
 
 
 def _of_seed(one: Planned, point: Point, settings: Mapping[str, Any]) -> Planned:
-    """Return a planned point that differs from the given one only in its random seed."""
+    """Return a planned point that differs only in its random seed."""
     system = one.state["system"]
     dynamics = {**system["dynamics"], "seed": settings["dynamics.seed"]}
     state = {**one.state, "system": {**system, "dynamics": dynamics}}
@@ -189,9 +189,9 @@ def _of_seed(one: Planned, point: Point, settings: Mapping[str, Any]) -> Planned
 
 
 def resolved(simulation: Any, settings: Mapping[str, Any]) -> Any:
-    """Return a copy of a simulation or of a ball system with other values of the given keys.
+    """Return a copy of a simulation or ball system with other values of some keys.
 
-    Initial velocities of atoms are drawn with the seed, as for a system file.
+    The seed draws initial velocities, as for a system file.
     """
     from mdnum.systems import BallSystem
     from mdnum.systems.load import vary
@@ -220,7 +220,7 @@ def _axes(over: Any) -> list[Axis]:
 
 
 def _own_value(axis: Axis, own: Mapping[str, Any], loaded: Any, system: Any, overrides: Any) -> Any:
-    """Return a choice's base value: that of the system file or, if there is none, the first in the sweep."""
+    """Return a choice's base value: that of the system file, or else the first in the sweep."""
     from mdnum.systems import BallSystem, load
     from mdnum.systems.parameters import names, number, resolve
 

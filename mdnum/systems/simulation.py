@@ -52,7 +52,7 @@ class Origin:
 class Simulation:
     """A simulation, which is the input of every command, reference method and calculator.
 
-    A simulation is created from a structure by `mdnum.simulation`, or from a system file by `mdnum.build`.
+    `mdnum.simulation` creates a simulation from a structure, `mdnum.build` from a system file.
 
     Example:
         >>> sim = mdnum.build("argon/liquid-864")
@@ -123,7 +123,7 @@ class Simulation:
 
     @property
     def file(self) -> System | None:
-        """System file that describes the simulation; None if no file describes the simulation exactly."""
+        """System file that describes the simulation, or None if no file describes it exactly."""
         its = self.origin.parts
         same = bool(its) and all(getattr(self, name) is part for name, part in its.items())
         return self.origin.system if same else None
@@ -143,12 +143,12 @@ class Simulation:
 
     @property
     def pairwise(self) -> bool:
-        """True if the potential is a pair potential or a sum of pair potentials."""
+        """True if the potential is a pair potential or a sum of them."""
         return isinstance(self.model, CutPotential | Channels)
 
     @property
     def imposable(self) -> bool:
-        """Whether cutoff decisions can be imposed; False if the energy function applies its own cutoff."""
+        """Whether cutoff decisions can be imposed. False if the energy function applies its own cutoff."""
         return self.pairwise or self.model.trusts_list
 
     @property
@@ -163,7 +163,7 @@ class Simulation:
 
     @property
     def cutoff(self) -> Any:
-        """Cutoff of a pair potential, or None if the potential contains its own cutoff."""
+        """Cutoff of a pair potential. None if the potential contains its own cutoff."""
         return self.model.cutoff if self.pairwise else None
 
     @property
@@ -173,7 +173,7 @@ class Simulation:
 
     @cached_property
     def force(self) -> PairForce | ManyBodyForce:
-        """Function that computes forces and cutoff decisions from a neighbor list, also inside jit."""
+        """Function that computes forces and cutoff decisions from a neighbor list."""
         # kept for later calls, so it must hold no tracer even where its first use is inside a jit
         with jax.ensure_compile_time_eval():
             parts = (self.model, self.cell, self.decider, self.policy, self.reduction)
@@ -185,7 +185,7 @@ class Simulation:
 
     @cached_property
     def propagator(self) -> Integrator:
-        """The integrator of the simulation, or its fixed-point version if the state is fixed-point.
+        """The integrator of the simulation. A fixed-point state has a fixed-point version.
 
         Raises:
             InputError: the integrator or its friction does not support a fixed-point state.
@@ -211,11 +211,11 @@ class Simulation:
         return self.file.program if self.file is not None else describe.program(self)
 
     def write(self, folder: str | Path) -> None:
-        """Write the system file and the structure, or a description of the objects, to a folder."""
+        """Write the system file (or a description of the objects) and the structure to a folder."""
         describe.write(self, Path(folder))
 
     def first_frame(self) -> tuple[Float[np.ndarray, "atoms 3"], Float[np.ndarray, "atoms 3"]]:
-        """Return the unwrapped positions and the velocities of step 0, in the precision of the state."""
+        """Return the unwrapped positions and the velocities of step 0."""
         if self.fixed_point is None:
             return self.positions, self.velocities
         scheme, masses = self.propagator, jnp.asarray(self.masses)
@@ -226,7 +226,7 @@ class Simulation:
 
     @property
     def channels(self) -> int:
-        """Number of cutoff decisions per pair of atoms; terms with equal cutoff radii share one decision."""
+        """Number of cutoff decisions per pair of atoms. Terms with equal cutoff radii share one."""
         return len(self.model.parts) if self.pairwise else 1
 
     @property
@@ -235,7 +235,7 @@ class Simulation:
         return len(self.decider.r_cut) // self.channels
 
     def type_of(self, i, j) -> Int[np.ndarray, "..."]:
-        """Return, for each pair of atoms, an index that depends on both species and the channel (cutoff).
+        """Return an index for each pair of atoms. It depends on both species and the channel (cutoff).
 
         Args:
             i: index of the first atom, plus the number of atoms times the index of the channel.
@@ -246,27 +246,27 @@ class Simulation:
         return channel * self.pair_types + pair_type(self.species[i], self.species[j], len(self.symbols))
 
     def first_atoms(self, i: Any) -> dict[str, Any]:
-        """Return the first atom of each pair, and the potential term if each term has its own decisions."""
+        """Return the first atom of each pair, and the term if terms decide separately."""
         if self.channels == 1:
             return {"i": i}
         channel, i = np.divmod(np.asarray(i, np.int64), self.atoms)
         return {"i": i, **self.terms_of(channel * self.pair_types)}
 
     def terms_of(self, kind: Any) -> dict[str, Any]:
-        """Return a table column with each decision's potential term; no column if there is one channel."""
+        """Return a table column with each decision's potential term, if there are several channels."""
         if self.channels == 1:
             return {}
         names = np.array([part.potential.name for part in self.model.parts])
         return {"terms": names[kind // self.pair_types]}
 
     def pair_of(self, i: int, j: int) -> dict[str, Any]:
-        """Return a table row with both atoms of a pair, and the term if each term has its own decisions."""
+        """Return a table row with both atoms of a pair, and the term if terms decide separately."""
         return {key: np.asarray(one).item() for key, one in self.first_atoms(i).items()} | {"j": int(j)}
 
     def jumps(self) -> tuple[Float[np.ndarray, "kinds"], Float[np.ndarray, "kinds"]]:
-        """Return the jumps of energy and radial force at the cutoff, for each type of cutoff decision.
+        """Return the jumps of energy and radial force at the cutoff, for each type of decision.
 
-        If atoms have weights, the result is an upper bound on the absolute jumps of any pair of atoms.
+        If atoms have weights, the result is an upper bound on the absolute jumps.
         """
         if not self.pairwise:
             smoothness = self.model.smoothness
@@ -279,7 +279,7 @@ class Simulation:
 
     @property
     def _weights(self) -> Float[np.ndarray, "terms atoms"] | None:
-        """Weight of each atom in each term of the potential, or None if no term has weights."""
+        """Weight of each atom in each term of the potential. None if there are no weights."""
         if not self.pairwise or not self.model.weights:
             return None
         each = (term.weights for term in self.model.terms.values())
@@ -313,7 +313,7 @@ class Simulation:
         return 16 * coarsest * float(np.linalg.norm(self.decider.reach.coordinate))
 
     def tables(self, table: PairTable) -> Tables:
-        """Copy a neighbor table to the device, and add the pair type of each entry."""
+        """Copy a neighbor table to the device. Add the pair type of each entry."""
         index, order = table.found, table.sorting
         atoms = index.shape[1]
         shape = (-1, SLOTS, atoms)
@@ -331,7 +331,7 @@ class Simulation:
         return Tables(jax.device_put(index.reshape(shape)), types, jax.device_put(order), edges)
 
     def with_model(self, model: Any) -> Simulation:
-        """Return the system with another potential; cutoff decisions then use the radii of the new potential.
+        """Return the system with another potential and its cutoff radii.
 
         Raises:
             InputError: the box is too small for the longest radius and the skin, or the precision of a
@@ -344,13 +344,13 @@ class Simulation:
 
     @property
     def apart(self) -> Simulation:
-        """The same system with separate decisions for each term, even if terms have equal cutoff radii."""
+        """The same system with separate decisions for each term of the potential."""
         return self.with_model(Channels.of_terms(self.model.terms, apart=True))
 
     def with_cutoff(self, cutoff: str | Cutoff) -> Simulation:
-        """Return the system with another kind of cutoff; the cutoff radius remains the same.
+        """Return the system with another kind of cutoff, but the same radius.
 
-        The onset of the switching function is kept; if there was none, the onset is 0.9 of the cutoff radius.
+        The onset of the switching function is kept. Without one, it is 0.9 of the cutoff radius.
         """
         made = CUTOFFS.parse(cutoff) if isinstance(cutoff, str) else cutoff
         return self._ended(lambda _: made)
@@ -368,18 +368,18 @@ class Simulation:
 
     @property
     def continuous(self) -> Simulation:
-        """The same system with an energy that is continuous at the cutoff; the forces do not change."""
+        """The same system with an energy that is continuous at the cutoff. The forces do not change."""
         if not self.pairwise or self.cutoff.smoothness >= 0:
             return self
         return self._ended(lambda end: end.continuous)
 
     def with_policy(self, policy: PrecisionPolicy = PrecisionPolicy()) -> Simulation:
-        """Return the system with a floating-point state, in the precision of a policy (default: float64)."""
+        """Return the system with a floating-point state in some precision (default: float64)."""
         decider = replace(self.decider, dtype=policy.decision, state=policy.state)
         return replace(self, policy=policy, decider=decider, fixed_point=None)
 
     def in_row(self, cell: Cell | None) -> Simulation:
-        """Return the system with the box of a given step, or the system itself if the box is constant."""
+        """Return the system with the box of a given step."""
         return self.with_cell(jax.tree.map(np.asarray, cell)) if self.integrator.moves_cell else self
 
     def with_cell(self, cell: Cell) -> Simulation:
@@ -415,7 +415,7 @@ class Simulation:
         return Evaluator(self, skin=0.0, often=False).numbers(positions)
 
     def inside(self, wrapped, table: PairTable, bits) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Return the pairs i < j that are inside the cutoff, sorted by i and j, and their distances."""
+        """Return the pairs i < j inside the cutoff, sorted by i and j, and their distances."""
         i, j = table.decided(bits)
         if self.channels > 1:
             i, j = np.divmod(np.unique(i % self.atoms * self.atoms + j), self.atoms)
@@ -426,7 +426,7 @@ class Simulation:
 
 
 def _edges(index: Int[np.ndarray, "slots atoms"], form: str) -> Int[np.ndarray, "first second"]:
-    """Return the pairs in a neighbor list, grouped by atom (for the format, see `Tables.edges`)."""
+    """Return the pairs in a neighbor list, grouped by atom (see `Tables.edges`)."""
     atoms = index.shape[1]
     if form == "dense":
         return np.ascontiguousarray(index.T, np.int32)

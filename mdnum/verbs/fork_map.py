@@ -1,4 +1,4 @@
-"""`mdnum fork map` and `mdnum fork forecast`: how decisions change with a parameter or the initial state."""
+"""`mdnum fork map` and `mdnum fork forecast`: how decisions change with a parameter or the start."""
 
 from __future__ import annotations
 
@@ -50,7 +50,7 @@ def command(system: str, along: str, **given: Any) -> Outcome:
 
 
 def interval(text: str) -> tuple[str, float, float]:
-    """Split a text of the form KEY=LOW:HIGH into the key and the two ends of the interval.
+    """Split a text KEY=LOW:HIGH into the key and the ends of the interval.
 
     Raises:
         InputError: the text is not of the form KEY=LOW:HIGH.
@@ -78,7 +78,7 @@ def fork_map(
     workers: int | None = None,
     **keep: Unpack[Keep],
 ) -> Outcome:
-    """Find parameter values, each between two adjacent floats, at which decisions of a run change.
+    """Find the parameter values at which decisions of a run change.
 
     Example:
         >>> mdnum.fork_map("argon/crystal-108", "cutoff.radius", 1.58, 1.59, steps=100)
@@ -183,7 +183,7 @@ def _row(edge: Boundary) -> dict[str, Any]:
 
 
 def judge_map(view: View) -> Verdict:
-    """Return the verdict on a map: parameter values at which decisions change, and jumps of the loss."""
+    """Return the verdict on a map: where decisions change, and jumps of the loss."""
     s = view.summary
     edges, left, failed = s["boundaries"], s["unresolved"], s["failed_runs"]
     all_failed = bool(failed) and failed == s["evaluations"]
@@ -268,7 +268,7 @@ def page_map(view: View, verdict: Verdict) -> Page:
 
 
 def _map_figures(view: View, numbered: bool) -> Iterator[Plot]:
-    """Yield figures of the loss, of the loss minus its trend, and of its jumps, all versus the parameter."""
+    """Yield figures of the loss, its deviation from the trend, and its jumps, versus the parameter."""
     s, points = view.summary, view.table("points")
     at, loss = points["at"], points["loss"]
     finite = np.isfinite(loss)
@@ -331,7 +331,7 @@ def _with_unit(text: str, unit: str) -> str:
 def fork_forecast(
     system: Simulation | System | str | Path, size: float, *, steps: int | None = None, **keep: Unpack[Keep]
 ) -> Outcome:
-    """Predict from one run's derivatives which decisions change first if initial positions change randomly.
+    """Predict which decisions change first if initial positions change randomly.
 
     Example:
         >>> mdnum.fork_forecast("argon/liquid-864", 1e-9)
@@ -379,7 +379,7 @@ def fork_forecast(
 
 
 def judge_forecast(view: View) -> Verdict:
-    """Return the verdict on a forecast: decisions expected to change first, and how long it is valid."""
+    """Return the verdict on a forecast: the first changed decisions, and how long it is valid."""
     s, unit = view.summary, view.units.length
     first, nearest, until, ends = s["first"], s["nearest"], s["until"], s["ends"]
     values = {**s, "unit": unit, "after": until + 1}

@@ -1,4 +1,4 @@
-"""Check that a calculator detects in-place changes of its input and does not modify its caller's data."""
+"""Check that a calculator detects in-place changes of its input and modifies no data of its caller."""
 
 from __future__ import annotations
 
@@ -24,8 +24,8 @@ _INFO = {"charge": 1, "spin": 2, "total_charge": 1, "multiplicity": 2}
 class CallerCheck(AuditCheck):
     """Does a calculator detect in-place changes of its input, without modifying its caller's data?
 
-    The check changes an `Atoms` object in place, as dynamics does, and tests the returned arrays and the
-    global random number generators.
+    The check changes an `Atoms` object in place. It also tests the returned arrays and the global random
+    number generators.
     """
 
     name, title, order, calls = "caller", "Caller", 30, 280
@@ -63,7 +63,7 @@ class CallerCheck(AuditCheck):
 
 
 def _changes(atoms: Atoms, rng: np.random.Generator) -> Iterator[tuple[str, Callable[[Atoms], Any]]]:
-    """Yield the name of each quantity, and a function that changes this quantity in an `Atoms` object."""
+    """Yield the name of each quantity, and a function that changes it in an `Atoms` object."""
     moves = 0.02 * rng.uniform(-1, 1, (len(atoms), 3))
     yield "positions", lambda there: np.add(there.positions, moves, out=there.positions)
     if len(set(atoms.numbers)) > 1:
@@ -81,7 +81,7 @@ def _changes(atoms: Atoms, rng: np.random.Generator) -> Iterator[tuple[str, Call
 def _edited(
     subject: CalculatorSubject, atoms: Atoms, noise: NoiseFloor, what: str, change: Callable[[Atoms], Any]
 ) -> Iterator[Observed]:
-    """Compare a calculator after an in-place change of its `Atoms` object with a new calculator object."""
+    """Change an `Atoms` object in place, and compare its calculator with a new object."""
 
     def asked() -> tuple[tuple[float, Forces], tuple[float, Forces]]:
         used, there = subject.used(), atoms.copy()
@@ -105,7 +105,7 @@ def _edited(
 
 
 def _buffers(subject: CalculatorSubject, atoms: Atoms) -> Iterator[Observed]:
-    """Test that returned arrays stay unchanged, and that writing to these arrays affects no later result."""
+    """Test that returned arrays stay unchanged. Writing to them must affect no later result."""
     used, there = subject.fresh(), atoms.copy()
     used.copies = False
     used.both(there)
@@ -130,7 +130,7 @@ def _buffers(subject: CalculatorSubject, atoms: Atoms) -> Iterator[Observed]:
 
 
 def _random(subject: CalculatorSubject, atoms: Atoms) -> Iterator[Observed]:
-    """Test whether a calculator call draws from or reseeds the global random number generators."""
+    """Test whether a calculator uses the global random number generators."""
     generators: dict[str, tuple[Callable[[], Any], Callable[[Any], Any], Callable[[int], Any]]] = {
         "numpy.random": (np.random.get_state, np.random.set_state, np.random.seed),
         "random": (random.getstate, random.setstate, random.seed),

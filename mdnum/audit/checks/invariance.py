@@ -1,4 +1,4 @@
-"""Check whether energy and forces change when the same structure is represented in another way."""
+"""Check whether energy and forces depend on how a structure is represented."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ _SEPARATE = {
 
 @dataclass(frozen=True)
 class Same:
-    """Another representation of a structure, for example with other periodic images of its atoms."""
+    """Another representation of a structure, for example with other images of its atoms."""
 
     what: str  # how it differs
     code: str  # of the finding when the calculator gives it another answer
@@ -62,7 +62,7 @@ def _same(code: str, base: Atoms, what: str, there: Atoms, factor: float = 1.0, 
 
 @dataclass(frozen=True)
 class _Difference:
-    """Actual and allowed differences in energy and force between two representations of one structure."""
+    """Actual and allowed differences between two representations of one structure."""
 
     same: Same
     energy: float
@@ -88,9 +88,9 @@ class _Difference:
 class InvarianceCheck(AuditCheck):
     """Do energy and forces of a structure depend on its representation?
 
-    Differences within the calculator's noise are allowed, as are differences that rounding of the coordinates
-    can cause. Both are measured. A transformation that the calculator does not support is skipped. If two
-    representations differ in energy or forces, `structures` contains both.
+    The calculator's noise is allowed, and so are differences that rounding of the coordinates can cause. Both
+    are measured. A transformation that the calculator does not support is skipped. If two representations
+    differ in energy or forces, `structures` contains both.
     """
 
     name, title, order, calls = "invariance", "Invariance", 40, 450
@@ -253,7 +253,7 @@ class _Judge:
         ), answer
 
     def reference(self, base: Atoms, rounding: float) -> tuple[float, Forces, NoiseFloor]:
-        """Return a structure's energy and forces, and the differences allowed for a given rounding error."""
+        """Return a structure's energy and forces, and the allowed differences."""
         power = int(np.ceil(np.log2(rounding))) if rounding > 0 else -9999
         key = id(base), power
         if key not in self._known:
@@ -273,7 +273,7 @@ class _Judge:
 
 
 def _refusals(refused: list[tuple[Same, CalculatorError]]) -> Iterator[Observed]:
-    """Yield findings about nonfinite results, and about exceptions for structures that must be supported."""
+    """Yield findings about nonfinite results, and about exceptions for valid structures."""
     empty = [one for one in refused if one[1].cause is None]
     raised = [one for one in refused if one[1].cause is not None and one[0].code in _MUST_ANSWER]
     for code, cases in (("NOT_FINITE", empty), ("FAILS", raised)):
@@ -286,7 +286,7 @@ def _refusals(refused: list[tuple[Same, CalculatorError]]) -> Iterator[Observed]
 
 
 def _in_turns(ways: Iterable[Same]) -> list[Same]:
-    """Order representations so that every kind is tested once before any kind is tested twice."""
+    """Order representations so that every kind is tested once before any is tested twice."""
     seen: dict[str, int] = {}
     turns = []
     for same in ways:
@@ -318,7 +318,7 @@ def all_of(atoms: Atoms, given: Atoms, rng: np.random.Generator) -> Iterator[Sam
 
 
 def translated(atoms: Atoms, rng: np.random.Generator) -> Iterator[Same]:
-    """Yield structures with all atoms translated together, by lattice vectors and by arbitrary vectors."""
+    """Yield structures with all atoms translated together, by lattice or arbitrary vectors."""
     same = partial(_same, "TRANSLATION", atoms)
     if atoms.pbc.any():
         for count, words in ((1, "one lattice vector"), (-3, "three lattice vectors back")):
@@ -338,7 +338,7 @@ def translated(atoms: Atoms, rng: np.random.Generator) -> Iterator[Same]:
 
 
 def imaged(atoms: Atoms, rng: np.random.Generator) -> Iterator[Same]:
-    """Yield structures with each atom in an arbitrary periodic image, as in unwrapped trajectories."""
+    """Yield structures with each atom in an arbitrary periodic image."""
     if not atoms.pbc.any():
         return
     same = partial(_same, "IMAGES", atoms)
@@ -350,7 +350,7 @@ def imaged(atoms: Atoms, rng: np.random.Generator) -> Iterator[Same]:
 
 
 def on_a_face(atoms: Atoms, rng: np.random.Generator) -> Iterator[Same]:
-    """Yield structures with one atom on a cell face, just outside the cell, or on the opposite face."""
+    """Yield structures with one atom on a cell face, just outside, or on the opposite face."""
     if not atoms.pbc.any():
         return
     axes, cell = np.flatnonzero(atoms.pbc), atoms.cell.array
@@ -390,7 +390,7 @@ def permuted(atoms: Atoms, rng: np.random.Generator) -> Iterator[Same]:
 
 
 def by_molecule(atoms: Atoms, rng: np.random.Generator) -> tuple[Same, Same] | None:
-    """Return structures with molecules reordered or in other periodic images; None if no molecules exist."""
+    """Return structures with molecules reordered or in other images. None if there are no molecules."""
     size = group(atoms)
     if size is None:
         return None
@@ -405,7 +405,7 @@ def by_molecule(atoms: Atoms, rng: np.random.Generator) -> tuple[Same, Same] | N
 
 
 def by_an_ulp(atoms: Atoms, given: Atoms) -> Iterator[Same]:
-    """Yield structures with the same positions and a cell that is larger or smaller by a rounding error."""
+    """Yield structures with the same positions, and a cell changed by a rounding error."""
     if not atoms.pbc.any():
         return
     for what, base in (("", atoms), (", of the structure as it was given", given)):
@@ -433,11 +433,11 @@ def repeated(atoms: Atoms) -> Iterator[Same]:
 
 
 def narrow(atoms: Atoms, rng: np.random.Generator) -> Iterator[Same]:
-    """Yield a supercell of a dense four-atom cell, for comparison with the four-atom cell.
+    """Yield a supercell of a dense four-atom cell.
 
     In cells at least two cutoffs wide, no atom interacts with two images of another atom. The four-atom cell
-    contains one species, or equal numbers of atoms of two species. Structures with more than two species are
-    not tested, since the result would be ambiguous.
+    contains one species, or equal numbers of two species. Structures with more than two species are not
+    tested.
     """
     species = list(dict.fromkeys(atoms.symbols))
     nearest = nearest_distance(atoms)
@@ -454,7 +454,7 @@ def narrow(atoms: Atoms, rng: np.random.Generator) -> Iterator[Same]:
 
 
 def skewed(atoms: Atoms) -> Iterator[Same]:
-    """Yield the same crystal lattice described by other lattice vectors, some of them left-handed."""
+    """Yield the same crystal lattice with other lattice vectors, some of them left-handed."""
     if not atoms.pbc.all():
         return
     for what, matrix in (
@@ -470,7 +470,7 @@ def skewed(atoms: Atoms) -> Iterator[Same]:
 
 
 def turned(atoms: Atoms, rng: np.random.Generator) -> Iterator[Same]:
-    """Yield the structure and its cell mirrored, rotated by arbitrary angles, or with permuted axes."""
+    """Yield the structure and its cell mirrored, rotated, or with permuted axes."""
     q, r = np.linalg.qr(rng.standard_normal((3, 3)))
     anyhow = q * np.sign(np.diag(r))
     anyhow *= np.sign(np.linalg.det(anyhow))
@@ -489,7 +489,7 @@ def turned(atoms: Atoms, rng: np.random.Generator) -> Iterator[Same]:
 
 
 def without_periods(atoms: Atoms) -> Iterator[Same]:
-    """Yield a cluster in several nonperiodic cells; the choice of cell must not change energy and forces."""
+    """Yield a cluster in several nonperiodic cells. All must give the same energy and forces."""
     base = modified(atoms, cell=np.zeros((3, 3)), pbc=False)
     span = np.ptp(base.positions, axis=0).max() + 30.0
     for what, cell in (
@@ -519,6 +519,6 @@ def _outward(atoms: Atoms, free: np.ndarray) -> np.ndarray:
 
 
 def ulp(*structures: Atoms) -> float:
-    """Return the unit in the last place (Å) of the largest coordinate or cell entry of structures."""
+    """Return the unit in the last place (Å) of the largest coordinate or cell entry."""
     parts = (part for one in structures for part in (one.positions, one.cell.array))
     return float(np.spacing(max(map(largest, parts))))

@@ -1,6 +1,6 @@
-"""Convert the pairs that a neighbor list returns to named arrays; several forms of pairs are accepted.
+"""Convert the pairs that a neighbor list returns to named arrays.
 
-This file is copied into the scripts that reproduce a failure; it requires only numpy.
+This file is copied into the scripts that reproduce a failure. It requires only numpy.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ _ROWS = "pairs one by one are to be tuples (i, j) in a list, or rows of an array
 
 
 class Malformed(Exception):
-    """Raised if a neighbor list returns a value that is not a list of pairs; the message says why."""
+    """Raised if a neighbor list returns a value that is not a list of pairs."""
 
 
 @dataclass(frozen=True)
@@ -43,20 +43,20 @@ class ListAnswer:
         return len(self.i)
 
     def same(self, other: ListAnswer) -> bool:
-        """Return whether two lists of pairs have the same rows in the same order."""
+        """Return whether two lists have the same pairs in the same order."""
         return all(map(np.array_equal, vars(self).values(), vars(other).values()))
 
 
 def read(given: Any) -> ListAnswer:
     """Return the pairs in a neighbor list's return value as a `ListAnswer`.
 
-    A neighbor list may return (i, j), (i, j, shift), (i, j, shift, distance), (i, j, shift, distance,
-    vector), or i and j with some of the optional arrays. The arrays are recognized by shape. An array with
-    one number per row contains distances. The first array with three integers per row contains shifts, and
-    another array with three numbers per row contains vectors. A mapping with the keys i, j, shift, distance
-    and vector, or an object with attributes of these names, is also accepted. A list of tuples (i, j), or one
-    array with a row (i, j) for each pair, is accepted too. A Python list of lists is always read as arrays,
-    not as pairs, since some such lists would be ambiguous.
+    A neighbor list may return (i, j), (i, j, shift), (i, j, shift, distance) or (i, j, shift, distance,
+    vector). It may also return i and j with some of the optional arrays. The arrays are recognized by shape.
+    An array with one number per row contains distances. The first array with three integers per row contains
+    shifts. Another array with three numbers per row contains vectors. A mapping with the keys i, j, shift,
+    distance and vector is also accepted, or an object with these attributes. A list of tuples (i, j) is
+    accepted, too, or one array with a row (i, j) for each pair. A Python list of lists is always read as
+    arrays, not as pairs.
 
     Raises:
         Malformed: the value has none of the supported forms.
@@ -79,7 +79,7 @@ def read(given: Any) -> ListAnswer:
 
 
 def parts(given: Any) -> dict[str, Any]:
-    """Return the arrays in the result of a neighbor list, named as in `ListAnswer`, with at least i and j.
+    """Return the arrays in the result of a neighbor list, named as in `ListAnswer`.
 
     Raises:
         Malformed: the value is not a list of pairs.

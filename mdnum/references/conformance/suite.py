@@ -209,7 +209,7 @@ class Examiner:
 
 
 def _ties(answer: ListAnswer, right: Truth) -> tuple[int, int]:
-    """Return the numbers of listed and unlisted pairs at r_cut. Both are 0 if coordinates are no integers."""
+    """Return the numbers of listed and unlisted pairs at r_cut. Both are 0 without integer coordinates."""
     numbers = np.concatenate([right.positions.ravel(), right.cell.ravel(), [right.r_cut]])
     if not ((numbers == np.rint(numbers)).all() and np.abs(numbers).max(initial=0.0) < 1e6):
         return 0, 0  # on small integers no arithmetic rounds
