@@ -1,10 +1,9 @@
-"""Energy balance of a run: energy jumps at thresholds and elsewhere, work of the forces, energy drift.
+"""Energy balance of a run: energy jumps, work of the forces, energy drift.
 
-If the force is minus the gradient of the energy, energy change plus work is zero along the straight line
-between two time steps, for every integrator. If an energy change at a distance threshold is not explained by
-the work of the forces, it is the energy jump of a flip. An unexplained change at a single point that is not a
-distance threshold is due to a limit on the number of neighbors or a selection of nearest neighbors. An
-unexplained change spread over many points means that the force is not minus the gradient of the energy.
+If the force is minus the energy gradient, energy change plus work is zero in every step. An energy change
+without work at a distance threshold is the energy jump of a flip. An energy jump elsewhere is due to a limit
+on the number of neighbors or a selection of nearest neighbors. An unexplained change at many points means
+that the force is not minus the energy gradient.
 """
 
 from __future__ import annotations
@@ -68,7 +67,7 @@ class NveRun:
         return there
 
     def way(self, step: int, share: float) -> Float[np.ndarray, "atoms 3"]:
-        """Return the positions at a given fraction of the straight line between two time steps."""
+        """Return the positions at a fraction of the line between two time steps."""
         return self.positions[step - 1] + share * (self.positions[step] - self.positions[step - 1])
 
 
@@ -90,12 +89,12 @@ class RunCrossing:
 
     @property
     def sign(self) -> float:
-        """Crossing direction: 1 if the pair distance falls below the threshold, -1 if it rises above it."""
+        """Crossing direction: 1 if the pair distance falls below the threshold, else -1."""
         return 1.0 if self.entered else -1.0
 
 
 def crossings(run: NveRun, thresholds: Sequence[PairThreshold]) -> list[RunCrossing]:
-    """Find all flips of a run, for any number of distance thresholds, in order of time."""
+    """Find all flips of a run, in order of time."""
     species, cell, found = set(run.start.get_chemical_symbols()), run.start.cell.array, []
     for threshold in (one for one in thresholds if set(one.species) <= species):
         radius, skin, reference = threshold.radius, 0.0, run.positions[0]
@@ -128,7 +127,7 @@ def _furthest(moved: Float[np.ndarray, "atoms 3"]) -> float:
 
 
 def _root(start: Float[np.ndarray, "3"], way: Float[np.ndarray, "3"], square: float) -> float:
-    """Return the fraction s in [0, 1] at which the vector start + s * way has the squared length `square`."""
+    """Return the fraction s in [0, 1] at which |start + s * way|² = `square`."""
     a, b, c = float(way @ way), 2 * float(start @ way), float(start @ start) - square
     inside = b * b - 4 * a * c
     if a == 0 or inside < 0:
@@ -140,7 +139,7 @@ def _root(start: Float[np.ndarray, "3"], way: Float[np.ndarray, "3"], square: fl
 
 
 def along_step(subject: CalculatorSubject, run: NveRun, step: int, ends: bool = False) -> Curve:
-    """Energy and force on the line between two steps; if `ends` is true, both ends have the run's values."""
+    """Energy and force on the line between two steps. If `ends` is true, the ends have the run's values."""
     way = run.positions[step] - run.positions[step - 1]
 
     def at_share(share: float) -> tuple[float, float]:
@@ -156,7 +155,7 @@ def along_step(subject: CalculatorSubject, run: NveRun, step: int, ends: bool = 
 def account(
     subject: CalculatorSubject, run: NveRun, step: int, crossed: Sequence[RunCrossing], smooth: int = 2
 ) -> tuple[list[float], float]:
-    """Compute the work of the forces between two time steps, piece by piece between threshold crossings.
+    """Compute the work of the forces between two time steps, in pieces between crossings.
 
     Args:
         subject: a calculator object separate from the run's; called three times per crossing, plus once.
@@ -190,7 +189,7 @@ def account(
 
 
 def _unexplained(curve: Curve, low: float, high: float) -> float:
-    """Sum of energy change and work of the force (by Simpson's rule); 0 if the force is -dE/dx."""
+    """Sum of energy change and work of the force (Simpson's rule). 0 if the force is -dE/dx."""
     if high <= low:
         return 0.0
     (before, first), (after, last) = curve(low), curve(high)
@@ -199,7 +198,7 @@ def _unexplained(curve: Curve, low: float, high: float) -> float:
 
 @dataclass(frozen=True)
 class HiddenJump:
-    """A point on the straight line between two steps at which the energy jumps."""
+    """A point between two steps at which the energy jumps."""
 
     step: int  # at its end
     share: float  # of the way
@@ -210,7 +209,7 @@ class HiddenJump:
 
 @dataclass(frozen=True)
 class HiddenJumps:
-    """Energy jumps found in those time steps whose energy change has no other explanation."""
+    """Energy jumps in those time steps with an unexplained energy change."""
 
     jumps: tuple[HiddenJump, ...] = ()  # found in the steps that were searched
     steps: Mapping[int, float] = field(default_factory=dict)  # those, with what they left unexplained, eV
@@ -218,7 +217,7 @@ class HiddenJumps:
 
     @property
     def share(self) -> float:
-        """Fraction of the otherwise unexplained energy change that is due to jumps, in the searched steps."""
+        """Fraction of the energy change that jumps explain."""
         whole = sum(abs(rest) for rest in self.steps.values())
         left = sum(abs(rest - self.brought(step)) for step, rest in self.steps.items())
         return max(1.0 - left / whole, 0.0) if whole else 0.0
@@ -228,7 +227,7 @@ class HiddenJumps:
         return sum(jump.energy for jump in self.jumps if jump.step == step)
 
     def energies(self, rest: Steps) -> Steps:
-        """Energy change (eV) of each step due to hidden jumps; estimated for steps not searched."""
+        """Energy change (eV) of each step due to hidden jumps. Estimated for steps not searched."""
         found = np.zeros(len(rest))
         for step in self.candidates:
             found[step] = self.brought(step) if step in self.steps else self.share * rest[step]
@@ -236,12 +235,12 @@ class HiddenJumps:
 
     @property
     def rank(self) -> tuple[int, int]:
-        """Rank k for which neighbors k and k+1 swap most often at energy jumps; number of such jumps."""
+        """Rank k for which neighbors k and k+1 swap most often at jumps, and number of these jumps."""
         return _most_frequent(k for jump in self.jumps for k in {k for _, k in jump.ties})
 
     @property
     def radius(self) -> tuple[float, int]:
-        """Distance threshold that pairs cross most often at a jump, and the number of such jumps."""
+        """Distance that pairs cross most often at a jump, and number of these jumps."""
         return _most_frequent(jump.radius for jump in self.jumps if jump.radius is not None)
 
 
@@ -256,7 +255,7 @@ def hidden_jumps(
     crossed: Mapping[int, Sequence[RunCrossing]],
     noise: float,
 ) -> HiddenJumps:
-    """Search the time steps with the largest unexplained energy change for points at which the energy jumps.
+    """Search the steps with the largest unexplained energy changes for energy jumps.
 
     Args:
         rest: unexplained energy change of each step, eV; nan where unknown.
@@ -315,25 +314,25 @@ class EnergyBalance:
 
     @property
     def elsewhere(self) -> Steps:
-        """Energy change at each step due to jumps other than those at distance thresholds, eV."""
+        """Energy change of each step due to jumps not at distance thresholds, eV."""
         return self.hidden.energies(self.rest)
 
     @property
     def filled(self) -> Steps:
-        """Unexplained energy change of each step without its jumps, eV; unmeasured steps have the mean."""
+        """Unexplained energy change of each step without jumps, eV. Unmeasured steps have the mean."""
         left = self.rest - self.elsewhere
         return np.where(np.isnan(left), np.nanmean(left), left)
 
     @property
     def means(self) -> dict[PairThreshold, float]:
-        """For each threshold, mean energy jump (eV) when the distance of a pair falls below the threshold."""
+        """Mean energy jump (eV) at each threshold, for a pair that comes closer."""
         found: dict[PairThreshold, list[float]] = {}
         for place, jump in self.measured.items():
             found.setdefault(self.crossed[place].threshold, []).append(self.crossed[place].sign * jump)
         return {threshold: float(np.mean(jumps)) for threshold, jumps in found.items()}
 
     def by_means(self, crossed: Sequence[RunCrossing], steps: int) -> Steps:
-        """Estimate the energy changes (eV) due to flips in another run, from this run's mean energy jumps."""
+        """Estimate the energy changes (eV) at flips of another run, from mean jumps."""
         jumps, means = np.zeros(steps), self.means
         for one in crossed:
             jumps[one.step] += one.sign * means.get(one.threshold, 0.0)
@@ -392,7 +391,7 @@ def balance(
 
 @dataclass(frozen=True)
 class Drift:
-    """Rate at which a quantity changes with time, and the standard error of this rate."""
+    """Rate at which a quantity changes with time, and its standard error."""
 
     slope: float  # per unit of time
     error: float  # standard error of it, from blocks
@@ -412,10 +411,10 @@ class Drift:
 
 
 def drift(time: Steps, values: Steps) -> Drift:
-    """Return the slope of a straight line fitted to block averages, with its standard error.
+    """Return the slope of a line fitted to block averages, with its standard error.
 
-    Values at neighboring time steps are correlated. Blocks are longer than the correlation time, so that
-    averages of different blocks are independent if the run is long enough. The fit needs at least 16 values.
+    Values at neighboring time steps are correlated. Blocks are longer than the correlation time, to make
+    their averages independent. The fit needs at least 16 values.
     """
     blocks = np.array_split(np.arange(len(values)), _BLOCKS)
     x, y = ([float(row[block].mean()) for block in blocks] for row in (time, values))
@@ -424,10 +423,10 @@ def drift(time: Steps, values: Steps) -> Drift:
 
 
 def wandering(time: Steps, increments: Steps) -> Drift:
-    """Return the drift of a quantity that changes by uncorrelated increments, such as energy jumps.
+    """Return the drift of a quantity with uncorrelated increments, such as energy jumps.
 
     The deviation of a random walk from a fitted line is itself a random walk. The standard error is therefore
-    computed from sums over blocks, not from deviations from the line.
+    computed from sums over blocks.
 
     Args:
         increments: at least 16, each of the interval that ends at its time.
@@ -439,9 +438,9 @@ def wandering(time: Steps, increments: Steps) -> Drift:
 
 
 def ratio(time: Steps, total: Steps, kinetic: Steps) -> float:
-    """Return the total energy drift of a run divided by the standard deviation of the kinetic energy.
+    """Return the total energy drift divided by the standard deviation of the kinetic energy.
 
-    Source: the energy conservation score of mlipaudit; lambench instead reports the drift in meV/atom/ps.
+    Source: the energy conservation score of mlipaudit. lambench reports the drift in meV/atom/ps.
     """
     slope = float(np.polyfit(time - time[0], total - total[0], 1)[0])
     scatter = float(np.std(kinetic))

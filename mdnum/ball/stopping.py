@@ -70,7 +70,7 @@ class StopRule(Protocol):
         ...
 
     def threshold(self, first: Float[Array, "..."], iteration: Int[Array, "..."]) -> Float[Array, "..."]:
-        """Return the threshold of an iteration; `first` is the residual before the first iteration."""
+        """Return the threshold of an iteration. `first` is the initial residual."""
         ...
 
 
@@ -90,7 +90,7 @@ class _ToleranceRule(eqx.Module):
 
 
 class GlobalSum(_ToleranceRule):
-    """Stopping rule that compares the sum of the residuals of all balls with a tolerance."""
+    """Stopping rule that compares the sum of all residuals with a tolerance."""
 
     reduction: Reduction = eqx.field(static=True, default=Pairwise())
 
@@ -113,10 +113,10 @@ class Maximum(_ToleranceRule):
 
 
 class Relative(GlobalSum):
-    """Stopping rule that compares the sum of residuals with the tolerance times the initial sum."""
+    """Stopping rule that compares the sum of residuals with tol times the initial sum."""
 
     def threshold(self, first, iteration):
-        """Return tol times the initial residual, or the smallest normal number if the residual is 0."""
+        """Return tol times the initial residual. For a residual of 0, return the smallest normal number."""
         scaled = jnp.asarray(self.tol).astype(first.dtype) * first
         # float32's smallest would be 0 in float16, and no residual is below that
         least = jnp.finfo(first.dtype).tiny
@@ -124,27 +124,27 @@ class Relative(GlobalSum):
 
 
 class HysteresisStop(eqx.Module):
-    """Hysteresis: the solver starts only if the residual exceeds `enter`, and stops at a lower threshold."""
+    """Hysteresis: the solver starts above the threshold `enter`, and stops below a lower threshold."""
 
     rule: _ToleranceRule  # says what the residual is, and where a solver that has started stops
     enter: Any  # a residual below this starts no solve; at least the rule's tolerance
 
     @property
     def max_iter(self) -> int:
-        """Largest permitted number of iterations, as set by the rule that stops the solver."""
+        """Largest number of iterations that the rule permits."""
         return self.rule.max_iter
 
     def measure(self, terms, accumulate, decision, zero):
         return self.rule.measure(terms, accumulate, decision, zero)  # type: ignore[attr-defined]
 
     def threshold(self, first, iteration):
-        """Return `enter` before the first iteration, and the threshold for stopping at later iterations."""
+        """Return `enter` before the first iteration, and then the threshold for stopping."""
         enter = jnp.asarray(self.enter).astype(first.dtype)
         return jnp.where(iteration == 0, enter, self.rule.threshold(first, iteration))
 
 
 class FixedCount(eqx.Module):
-    """Stopping rule with a fixed number of iterations, which does not depend on the residual."""
+    """Stopping rule with a fixed number of iterations."""
 
     count: int = eqx.field(static=True, default=10)  # iterations; also the cap
 
@@ -157,7 +157,7 @@ class FixedCount(eqx.Module):
     measure = Maximum.measure
 
     def threshold(self, first, iteration):
-        """Return a threshold that stops the solver exactly after the fixed number of iterations."""
+        """Return a threshold that stops the solver after the fixed number of iterations."""
         reached = jnp.broadcast_to(iteration >= self.count, first.shape)
         return jnp.where(reached, np.inf, -np.inf).astype(first.dtype)
 
@@ -173,7 +173,7 @@ def iterate(
     imposed: Int[Array, "..."] | None = None,
     history: bool = False,
 ) -> tuple[Any, Solve]:
-    """Iterate until the rule stops the solver, or until a maximum or imposed number of iterations is reached.
+    """Iterate until the rule stops the solver, or up to a maximum or imposed number of iterations.
 
     Args:
         rule: stopping rule.
@@ -246,12 +246,12 @@ def no_solve(dtype: Any) -> Solve:
 
 
 def elementwise(function: Map) -> Map:
-    """Return a version of a function with a `while_loop` that is differentiable in forward and reverse mode.
+    """Return a differentiable version of a function with a `while_loop`.
 
-    JAX has no reverse mode for a `while_loop`, because the required memory is not known in advance. A
-    function that treats each ball separately has a diagonal Jacobian, which forward mode can compute. Forward
-    mode runs in the same loop, so iterations need not be stored. Decisions are held fixed in the derivative.
-    The record of the solve and the inputs in `rest` are not differentiated.
+    JAX has no reverse mode for a `while_loop`, since its memory is not known in advance. If a function treats
+    balls separately, its Jacobian is diagonal. Forward mode can compute this Jacobian. Forward mode runs in
+    the same loop, so iterations need not be stored. Decisions are held fixed in the derivative. The record of
+    the solve and the inputs in `rest` are not differentiated.
 
     Args:
         function: a function whose outputs for ball b depend only on the inputs for ball b (and on `rest`).

@@ -64,13 +64,13 @@ def parse_overrides(settings: Sequence[str] | None) -> dict[str, str]:
 
 
 def print_json(document: Mapping[str, Any]) -> int:
-    """Print the JSON document of a command to stdout, and return the exit code of a successful command."""
+    """Print a JSON document to stdout. Return the exit code of success."""
     say(printable(json.dumps(plain(document), indent=2, ensure_ascii=False, allow_nan=False), json_escape))
     return EXIT_FINE
 
 
 def print_reply(reply: Reply, as_json: bool) -> int:
-    """Print the reply of a command that writes no run folder, as JSON or text; return the exit code."""
+    """Print the reply of a command without a run folder. Return the exit code."""
     if as_json:
         print_json(reply.document)
     for one in () if as_json else reply.shown:
@@ -91,7 +91,7 @@ def say(text: str, *, err: bool = False) -> None:
 
 
 def print_error(error: MdnumError, *, as_json: bool) -> None:
-    """Print an error as one line on stderr, and also as a JSON document if requested."""
+    """Print an error as one line on stderr, and as JSON if requested."""
     say("mdnum: " + " ".join(str(error).split()), err=True)
     if as_json:
         told = {name: getattr(error, name) for name in ("message", "where", "remedy", "exit_code")}
@@ -105,7 +105,7 @@ def print_lines(lines: Iterable[str]) -> None:
 
 
 def console(width: int = _PIPE_WIDTH) -> Console:
-    """Return rich's console for stdout, which escapes control characters; rich is imported on first use."""
+    """Return rich's console for stdout. It escapes control characters."""
     from rich.console import Console
     from rich.segment import Segment
 
@@ -120,7 +120,7 @@ def console(width: int = _PIPE_WIDTH) -> Console:
 
 
 def print_prose(text: str, indent: int = 2, style: str = "") -> None:
-    """Print a paragraph that is wrapped to a readable width; long words are not broken."""
+    """Print a paragraph, wrapped to a readable width. Long words are not broken."""
     from textwrap import fill
 
     from rich.text import Text
@@ -134,7 +134,7 @@ def print_prose(text: str, indent: int = 2, style: str = "") -> None:
 
 
 def print_table(title: str, columns: Sequence[str], rows: Iterable[Sequence[Any]]) -> None:
-    """Print a table; severities are colored, and the header is omitted if no column has a name."""
+    """Print a table with colored severities. Without column names, it has no header."""
     from rich.table import Table
     from rich.text import Text
 
@@ -151,7 +151,7 @@ def print_table(title: str, columns: Sequence[str], rows: Iterable[Sequence[Any]
 
 
 def print_records(title: str, records: Sequence[Mapping[str, Any]]) -> None:
-    """Print a table of records, transposed if there are few records with many fields."""
+    """Print a table of records. Few records with many fields are transposed."""
     columns = list(dict.fromkeys(key for record in records for key in record))
     rows = [[record.get(column) for column in columns] for record in records]
     if len(rows) > _FEW or len(columns) <= _MANY:
@@ -162,7 +162,7 @@ def print_records(title: str, records: Sequence[Mapping[str, Any]]) -> None:
 
 
 def show(cell: Any) -> str:
-    """Format a value for a table cell: floats in short form, None as a dash, booleans as yes or no."""
+    """Format a value for a table cell: short floats, a dash for None, yes or no for booleans."""
     if cell is None:
         return "-"
     if isinstance(cell, bool):
@@ -173,7 +173,7 @@ def show(cell: Any) -> str:
 
 
 def print_findings(findings: Iterable[Finding]) -> None:
-    """Print each finding: a title line with its code, the observation, and the remedy."""
+    """Print each finding: its title and code, the observation, and the remedy."""
     from rich.text import Text
 
     for finding in findings:
@@ -187,7 +187,7 @@ def print_findings(findings: Iterable[Finding]) -> None:
 
 
 def exit_code(findings: Iterable[Finding], status: str = "complete") -> int:
-    """Return the exit code of a command, which is 1 if a finding is a warning or an error.
+    """Return the exit code: 1 if a finding is a warning or an error.
 
     Args:
         findings: findings of the command; findings of severity "info" do not count.
@@ -200,7 +200,7 @@ def exit_code(findings: Iterable[Finding], status: str = "complete") -> int:
 
 
 def print_outcome(outcome: Outcome, *, as_json: bool) -> int:
-    """Print the result of a command, as JSON or as a summary of its report page; return the exit code."""
+    """Print the result of a command, as JSON or as a summary. Return the exit code."""
     code = exit_code(outcome.verdict.findings, outcome.summary.get("status", "complete"))
     if as_json:
         print_json({**outcome.summary, "folder": outcome.folder})
@@ -256,7 +256,7 @@ class CommandBar(ProgressBar):
 
 @contextmanager
 def watched(remedy: Callable[[], str | None]) -> Iterator[ProgressBar]:
-    """Show a progress bar during a command, and convert control-C into the error `Stopped`.
+    """Show a progress bar during a command. Control-C raises `Stopped`.
 
     Args:
         remedy: called after control-C to get the remedy for the error message.
@@ -274,7 +274,7 @@ def watched(remedy: Callable[[], str | None]) -> Iterator[ProgressBar]:
 
 
 def is_interrupt(error: BaseException | None) -> bool:
-    """Return True if control-C caused an error, even inside an import or compiled code."""
+    """Return True if an error comes from control-C, even in compiled code."""
     while error is not None and not isinstance(error, KeyboardInterrupt | MdnumError):
         error = error.__cause__ or (None if error.__suppress_context__ else error.__context__)
     return isinstance(error, KeyboardInterrupt)

@@ -1,9 +1,8 @@
-"""Neighbor search in XLA; neighbor lists are built and stored on the device that holds the positions.
+"""Neighbor search in XLA. The lists stay on the device of the positions.
 
-An atom is compared with the atoms in neighboring bins, in the same order as in `md.host_search`. Searches on
-the device and on the host therefore build the same neighbor table from the same bins. A search copies two
-numbers to the host: the largest number of atoms in a bin, and the largest number of neighbors. Extents of the
-atoms along nonperiodic axes are also copied to the host.
+Atoms are compared in the same order as in `md.host_search`. Device and host therefore build the same neighbor
+table from the same bins. A search copies two numbers to the host: the largest number of atoms in a bin, and
+of neighbors. Extents of the atoms along nonperiodic axes are also copied to the host.
 """
 
 from __future__ import annotations
@@ -37,7 +36,7 @@ class DeviceBuilder:
     def build(
         self, positions: Float[Array | np.ndarray, "atoms 3"], cell: Cell, r_list: float, slots: int
     ) -> tuple[Int[Array, "slots atoms"], Int[Array, "atoms"], int]:
-        """Build a neighbor list as `neighbors.ListBuilder.build` does, but keep its arrays on the device."""
+        """Build a neighbor list as `neighbors.ListBuilder.build` does. Its arrays stay on the device."""
         x = jnp.asarray(positions, np.float64).T
         extent, low, high = cell.widths.copy(), np.zeros(3), np.ones(3)
         if not all(cell.pbc):
@@ -90,7 +89,7 @@ def _binned(x, cell: Cell, low, span, bins: _Whole):
 def _searched(
     x, places, cell: Cell, start, r2_list, bins: _Whole, reach: _Whole, room: int, slots: int, blocks: int
 ):
-    """Return the neighbors of each atom and their largest number; neighbors beyond `slots` are missing."""
+    """Return the neighbors of each atom and their largest number. Neighbors beyond `slots` are missing."""
     atoms = x.shape[1]
     matrix = cell.matrix
     # layer after layer along the third axis, as the host goes

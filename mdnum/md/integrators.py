@@ -1,9 +1,9 @@
-"""Integrators, which update the state between two force evaluations, and the function that makes a time step.
+"""Integrators, and the function that makes a time step.
 
-A step evaluates the forces at x_s and completes the previous step (`finish`), which gives full-step
-velocities v_s. The first half of the next step (`begin`) gives the positions x_{s+1}. The state between steps
-is (x_{s+1}, half-step velocity, extra). An outdated neighbor list is therefore replaced before forces are
-evaluated. A simulation can stop and resume between steps without evaluating forces twice.
+A step evaluates the forces at x_s. `finish` completes the previous step and gives full-step velocities v_s.
+The first half of the next step (`begin`) gives the positions x_{s+1}. The state between steps is (x_{s+1},
+half-step velocity, extra). An outdated neighbor list is therefore replaced before forces are evaluated. A
+simulation can stop and resume between steps without evaluating forces twice.
 """
 
 from __future__ import annotations
@@ -34,12 +34,12 @@ Order = Int[Array, "atoms"]
 
 
 def unsorted(a: Real[Any, "*rest atoms"], order: Int[Any, "atoms"]) -> Real[Array, "*rest atoms"]:
-    """Convert a per-atom array from the sorted order of a neighbor list to the order of the input."""
+    """Convert a per-atom array from sorted order to the order of the input."""
     return jnp.zeros_like(a).at[..., order].set(a)
 
 
 class ByAtom(NamedTuple):
-    """Array in an integrator's extra state, with one entry per atom (last axis), sorted like the atoms."""
+    """Array in an integrator's extra state, with one entry per atom (last axis)."""
 
     value: Array
 
@@ -65,7 +65,7 @@ _INSIDE = {
 
 
 def converted(field: Field[Any], value: Any, units: Units, *, back: bool = False) -> Any:
-    """Convert a number from a system file's unit to the internal unit of an integrator field, or back."""
+    """Convert a number from a system file's unit to the internal unit, or back."""
     if (unit := field.metadata.get("unit")) not in _INSIDE:
         return value
     *ways, factor = _INSIDE[unit]
@@ -75,15 +75,15 @@ def converted(field: Field[Any], value: Any, units: Units, *, back: bool = False
 def quantity(
     unit: Literal["time", "rate", "temperature", "pressure", "compressibility", "seed"], **options: Any
 ) -> Any:
-    """Declare a field of an integrator that has a unit in system files, such as a time or a temperature.
+    """Declare a field of an integrator with a unit in system files.
 
-    In system files, the energy kT has the key `temperature`, and the random key has the key `seed`.
+    In system files, kT has the key `temperature` and the random key has the key `seed`.
     """
     return eqx.field(metadata={"unit": unit}, **options)
 
 
 class AtStep(NamedTuple):
-    """Data of a time step that an integrator receives after the force evaluation, with sorted atoms."""
+    """Data of a time step for an integrator, after the force evaluation."""
 
     acceleration: Vector  # force/mass, in the dtype of the state
     virial: Number  # sum over pairs of r_ij · F_ij, energy, float64
@@ -150,23 +150,23 @@ class Integrator(eqx.Module):
 
     @property
     def noise_belongs_to(self) -> tuple[str, ...]:
-        """Symmetries ("atoms", "axes") that are broken because noise depends on atom or axis indices."""
+        """Symmetries ("atoms", "axes") that the noise breaks."""
         return () if self.random is None else ("atoms", "axes")
 
     def number(self, key: str, units: Units) -> float:
-        """Return the value of a field by its key, in the units of a system file."""
+        """Return the value of a field in the units of a system file."""
         field = self.keys()[key]
         return converted(field, float(getattr(self, field.name)), units, back=True)
 
     def with_number(self, key: str, value: Any, units: Units) -> Integrator:
-        """Return a copy of the integrator with another value of a field, without recompilation."""
+        """Return a copy of the integrator with another value of a field. Nothing is recompiled."""
         field = self.keys()[key]
         # of a numpy number: a Python one would make another compiled program (a weak type)
         inner = jnp.asarray(np.float64(converted(field, value, units)))
         return eqx.tree_at(lambda one: getattr(one, field.name), self, inner)
 
     def init(self, x: Vector, v: Vector, masses: Masses) -> Any:
-        """Return the initial extra state, a pytree of numerical arrays, with per-atom arrays as `ByAtom`.
+        """Return the initial extra state, a pytree of arrays. Per-atom arrays are `ByAtom`.
 
         Args:
             x, v: wrapped positions and velocities of step 0, in the order of the user.
@@ -175,7 +175,7 @@ class Integrator(eqx.Module):
 
     @abstractmethod
     def finish(self, v: Vector, extra: Any, at: AtStep, time: Number) -> tuple[Vector, Any]:
-        """Complete a step after its force evaluation; return full-step velocities and the extra state.
+        """Complete a step after its force evaluation. Return full-step velocities and extra state.
 
         Args:
             v, extra: sorted velocities and extra state, as returned by `begin` and `deform`.
@@ -186,14 +186,14 @@ class Integrator(eqx.Module):
 
     @abstractmethod
     def begin(self, x: Vector, v: Vector, extra: Any, at: AtStep) -> tuple[Vector, Vector, Any, Number]:
-        """Begin a step; return positions, velocities and extra state of the next step, and the absorbed heat.
+        """Begin a step. Return the next positions, velocities and extra state, and the absorbed heat.
 
         Args:
             x, v: sorted positions and full-step velocities.
         """
 
     def deform(self, v: Vector, extra: Any, at: AtStep) -> tuple[Float[Array, "3 3"], Vector, Any]:
-        """Return the deformation of the box before the next force evaluation; the default is no deformation.
+        """Return the deformation of the box before the next force evaluation. Default: none.
 
         The method `deform` is called after `begin`. Lattice vectors and positions, as rows, are multiplied by
         the deformation. The method `begin` must move the atoms only relative to the box.
@@ -208,14 +208,14 @@ class Integrator(eqx.Module):
 
     @property
     def moves_cell(self) -> bool:
-        """True if the integrator defines `deform`; otherwise the box is constant and is not recorded."""
+        """True if the integrator changes the box (`deform`). Otherwise the box is not recorded."""
         return type(self).deform is not Integrator.deform
 
     def check(self, cell: Cell) -> None:
-        """Raise `InputError` for an unsupported box or option; `check` is called once, on the host."""
+        """Raise `InputError` for an unsupported box or option. Called once, on the host."""
 
     def freedom(self, masses: Float[Any, "atoms"]) -> int:
-        """Return the number of degrees of freedom: 3 per atom, minus 3 if the total momentum is zero."""
+        """Return the number of degrees of freedom: 3 per atom, minus 3 for zero total momentum."""
         return max(3 * masses.shape[0] - self.constraints, 1)
 
     def kinetic(self, v: Vector, masses: Masses) -> Number:
@@ -225,7 +225,7 @@ class Integrator(eqx.Module):
 
     @property
     def anisotropic(self) -> bool:
-        """True if the integrator needs the virial tensor, which makes force evaluations 10 % slower."""
+        """True if the integrator needs the virial tensor. Force evaluations are then 10 % slower."""
         return False
 
     @property
@@ -234,9 +234,9 @@ class Integrator(eqx.Module):
         return False
 
     def exchanged(self, extra: Any, at: AtStep) -> tuple[Number | float, Number | float]:
-        """Return the energies transferred to the atoms so far: thermostat heat, and work done by the box.
+        """Return the heat from the thermostat and the work of the box, so far.
 
-        The total energy minus heat and work, and minus the heat returned by `begin`, is conserved.
+        Total energy minus heat, work and the heat from `begin` is conserved.
         """
         return 0.0, 0.0
 
@@ -270,7 +270,7 @@ def one_step(
     *,
     wrap: bool = True,
 ) -> StepEnd:
-    """Make one time step, from the forces at the present positions to the positions of the next step.
+    """Make one time step, from the forces to the next positions.
 
     Args:
         cell: the box, float64. masses: float64. made: the `Forces` at x.
@@ -299,7 +299,7 @@ def one_step(
 
 
 class KickDrift(Integrator):
-    """Base class of integrators that alternate a kick by the forces with a drift independent of the forces.
+    """Base class of integrators with a kick by the forces and a drift independent of them.
 
     Example:
         >>> isinstance(mdnum.build("argon/langevin-500").integrator, mdnum.KickDrift)
@@ -333,11 +333,11 @@ class KickDrift(Integrator):
     def drift(
         self, x: Vector, v: Vector, masses: Masses, step: Step, order: Order
     ) -> tuple[Vector, Vector, Number]:
-        """Advance the state after the kick; the map must be linear in positions and velocities."""
+        """Advance the state after the kick. The map must be linear in positions and velocities."""
 
 
 def without_kick(integrator: Integrator) -> str | None:
-    """Return the reason why derivatives of kick and drift are invalid; None if the derivatives are valid."""
+    """Return why derivatives of kick and drift are invalid. None if they are valid."""
     if type(integrator) in (VelocityVerlet, Langevin):
         return None
     if isinstance(integrator, KickDrift) and _is_linear(integrator):
@@ -355,7 +355,7 @@ def check_kick(integrator: Integrator) -> None:
 
 
 def check_one_box(integrator: Integrator, what: str) -> None:
-    """Raise `InputError` if an integrator changes the box although a fixed box is required."""
+    """Raise `InputError` if an integrator changes the box where it must be fixed."""
     if integrator.moves_cell:
         raise InputError(
             f"{what} need a fixed box, but {integrator.name} changes the box", where="dynamics.kind"
@@ -363,7 +363,7 @@ def check_one_box(integrator: Integrator, what: str) -> None:
 
 
 def _is_linear(integrator: KickDrift) -> bool:
-    """Return True if the drift has equal derivatives with respect to position and velocity at two states."""
+    """Return True if the drift has equal derivatives at two states."""
     x, v, dx, dv = jax.random.normal(jax.random.key(0), (4, 3, 4), jnp.float64)
     zero, order = jnp.zeros((), jnp.int64), jnp.arange(4)
 
@@ -390,8 +390,8 @@ class VelocityVerlet(KickDrift):
 class Langevin(KickDrift):
     """Langevin dynamics, BAOAB (Leimkuhler & Matthews 2013): drift, exact Ornstein-Uhlenbeck step, drift.
 
-    The noise depends only on the random key and the step number. Two runs can therefore have the same noise,
-    and a resumed run continues its noise sequence.
+    The noise depends only on the random key and the step number. Two runs can therefore have the same noise.
+    A resumed run continues its noise.
 
     Example:
         >>> cut = mdnum.Cut("switched", 8.5)

@@ -1,15 +1,15 @@
-"""Elementary functions made of IEEE 754 operations; all machines return the same bits if none is fused.
+"""Elementary functions made of IEEE 754 operations, with the same results on all machines.
 
-Elementary functions differ between libraries, and between the instruction sets for which a compiler generates
-code. The functions of this module have no branch, no table and no fused multiply-add. Each function consists
-of sums, products, quotients, roots, comparisons, selections and bit operations. A function gives the same
-result wherever its operations are executed one by one, as in the compiled force loop.
+The elementary functions of libraries differ between versions and instruction sets. The functions here have no
+branch, no table and no fused multiply-add. Each function consists of sums, products, quotients, roots,
+comparisons, selections and bit operations. A function gives the same result wherever its operations are
+executed one by one.
 
-Arguments and results are float64. Subnormal arguments are treated as 0. Results below 2.2261e-308 are 0, and
-results of exponentials and powers above 1.7976e308 are infinite. Errors are in ulps; an ulp is the spacing of
-the floats at the result. The error bound of the exponential was derived by counting roundings. Every other
-bound is at least 1.3 times the largest measured error. Errors were measured for 100,000 arguments of error
-functions and for ten million arguments of other functions (docs/compiled-loop.md).
+Arguments and results are float64. Subnormal arguments are treated as 0. Results below 2.2261e-308 are 0.
+Exponentials and powers above 1.7976e308 are infinite. Errors are in ulps (spacing of the floats at the
+result). The error bound of the exponential was derived by counting roundings. Every other bound is at least
+1.3 times the largest measured error. Errors were measured for ten million arguments, and for 100,000 of error
+functions (docs/compiled-loop.md).
 """
 
 from __future__ import annotations
@@ -49,7 +49,7 @@ def _number(bits: Any) -> Any:
 
 
 def _short(x: Any) -> Any:
-    """Return x truncated to 26 binary digits, so that the product of two such numbers is exact."""
+    """Return x truncated to 26 bits. The product of two such numbers is exact."""
     return _number(_bits(x) & -(1 << 27))
 
 
@@ -58,7 +58,7 @@ def _with_sign(of: Any, x: Any) -> Any:
 
 
 def polynomial(coefficients: Sequence[float], x: Any) -> Any:
-    """Evaluate a polynomial by Horner's rule, with coefficients in descending order of the power."""
+    """Evaluate a polynomial by Horner's rule. Coefficients are in descending order."""
     total = coefficients[0] * x + coefficients[1]
     for c in coefficients[2:]:
         total = total * x + c
@@ -66,7 +66,7 @@ def polynomial(coefficients: Sequence[float], x: Any) -> Any:
 
 
 def _halved(coefficients: Sequence[Any], x: Any) -> Any:
-    """Evaluate a polynomial by Estrin's scheme, with coefficients in ascending order of the power."""
+    """Evaluate a polynomial by Estrin's scheme. Coefficients are in ascending order."""
     if len(coefficients) == 1:
         return coefficients[0]
     pairs = [a + b * x for a, b in zip(coefficients[::2], coefficients[1::2], strict=False)]
@@ -82,7 +82,7 @@ _EXP = (
 
 
 def _reduced(x: Any, low: Any = None) -> tuple[Any, Any]:
-    """Return p and n such that exp(x + low) = (1 + p) 2^n; n is in the last bits of the second result."""
+    """Return p and n such that exp(x + low) = (1 + p) 2^n. n is in the last bits of the second result."""
     shifted = x * (1 / math.log(2)) + _ROUND
     n = shifted - _ROUND
     r = (x - n * _LN2[0]) - n * _LN2[1]
@@ -126,7 +126,7 @@ _LOG = [2 / (2 * k + 1) for k in range(11, 0, -1)]
 
 
 def _split(x: Any) -> tuple[Any, Any]:
-    """Return n and m such that x = m 2^n, with m between √(1/2) and √2, for positive normal numbers x."""
+    """Return n and m such that x = m 2^n, with m between √(1/2) and √2. x is a positive normal number."""
     bits = _bits(x)
     exponent = _number(lax.shift_right_logical(bits, np.int64(_EXPONENT)) | _COUNT) - (2.0**52 + 1023)
     m = _number((bits & _MANTISSA) | _ONE)
@@ -255,5 +255,5 @@ FUNCTIONS: dict[str, Callable[..., Any]] = {
 
 
 def program(name: str, *shapes: tuple[int, ...]) -> ClosedJaxpr:
-    """Return the jaxpr of the elementary function with a given jax name, for arguments of given shapes."""
+    """Return the jaxpr of the elementary function with a jax name, for given shapes."""
     return jax.make_jaxpr(FUNCTIONS[name])(*(jax.ShapeDtypeStruct(shape, np.float64) for shape in shapes))

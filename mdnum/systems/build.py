@@ -1,4 +1,4 @@
-"""Building a simulation from a system file: conversion of the tables of the file to objects."""
+"""Building of a simulation from a system file."""
 
 from __future__ import annotations
 
@@ -88,7 +88,7 @@ def _pair_model(tables: schema.Interaction, atoms: Atoms, folder: Path, own: tup
 
 
 def build(system: Simulation | System | str | Path, overrides: Mapping[str, Any] | None = None) -> Simulation:
-    """Build a simulation from a system, given by name, by file or as a loaded object.
+    """Build a simulation from a system: a name, a file or an object.
 
     Example:
         >>> mdnum.build("argon/liquid-864", {"cutoff.kind": "switched"})

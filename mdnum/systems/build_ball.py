@@ -1,4 +1,4 @@
-"""Conversion of a bouncing ball's system file to objects: the model, its initial state and the loss."""
+"""Conversion of a bouncing ball's system file to model, initial state and loss."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ _RULES: Mapping[str, Any] = {
 
 @dataclass(frozen=True)
 class BallVariant:
-    """A variant of a bouncing-ball problem, in which some keys of the system file are changed."""
+    """A bouncing-ball problem with changed keys of the system file."""
 
     name: str  # what the file calls it
     changes: Mapping[str, Any]  # dotted keys to values
@@ -77,7 +77,7 @@ def build_ball(
 
 
 def problem(spec: ball.BallSpec, steps: int | None = None, where: str = "system") -> BallProblem:
-    """Create the model, the initial state, the number of steps and the loss from the tables of a system file.
+    """Create the model, the initial state, the number of steps and the loss of a system file.
 
     Raises:
         InputError: a number is outside the range that the model allows.
@@ -101,7 +101,7 @@ def problem(spec: ball.BallSpec, steps: int | None = None, where: str = "system"
 
 
 def start(spec: ball.BallSpec) -> tuple[Float[np.ndarray, "balls"], Float[np.ndarray, "balls"]]:
-    """Return heights (m) and velocities (m/s) of the balls at step 0, in float64 before rounding."""
+    """Return heights (m) and velocities (m/s) at step 0, in float64."""
     given, count = spec.start, spec.balls
     if given.boundary is not None:
         # one penetration an ulp short of the tolerance, and the ulp in equal parts
@@ -120,7 +120,7 @@ def start(spec: ball.BallSpec) -> tuple[Float[np.ndarray, "balls"], Float[np.nda
 
 
 def _control(table: ball.Control, h: float, steps: int) -> Float[np.ndarray, "steps"] | None:
-    """Return the additional acceleration in each time step, m/s², or None if gravity acts alone."""
+    """Return the acceleration in each time step besides gravity, m/s². None for gravity alone."""
     match table:
         case ball.ConstantControl():
             return np.full(steps, table.value)

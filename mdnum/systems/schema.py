@@ -1,8 +1,7 @@
-"""Schema of a molecular-dynamics system file: one pydantic model per table, with the unit of each number.
+"""Schema of a molecular-dynamics system file: one pydantic model per table.
 
-Validation is strict: a misspelled key, or a string in place of a number, is an error. Lengths, energies,
-masses, times and temperatures are in the units of the file: Å, eV, amu, ps and K for "metal", and reduced
-Lennard-Jones units (σ, ε, m, τ) for "lj".
+Validation is strict: a misspelled key or a string in place of a number is an error. Quantities are in the
+units of the file: Å, eV, amu, ps and K for "metal", and reduced Lennard-Jones units for "lj".
 """
 
 from __future__ import annotations
@@ -29,12 +28,12 @@ ONSET_FRACTION = 0.9
 
 
 def pair_key(a: str, b: str) -> str:
-    """Return the name of a pair of species, which does not depend on their order, such as "Ni-P"."""
+    """Return the name of a pair of species, such as "Ni-P". Their order has no effect."""
     return "-".join(sorted((a, b)))
 
 
 def pair_names(symbols: Sequence[str]) -> list[str]:
-    """Return the names of all pairs of species in the order of pair types, such as "Ni-Ni", "Ni-P", "P-P"."""
+    """Return the names of all pairs of species in the order of pair types ("Ni-Ni", "Ni-P", "P-P")."""
     return [f"{a}-{b}" for a, b in combinations_with_replacement(symbols, 2)]
 
 
@@ -74,7 +73,7 @@ class SoftSpherePair(TomlTable):
 
 
 class PairPotentialTable(TomlTable):
-    """A pair potential, with one set of constants for all pairs or one set for each pair of species."""
+    """A pair potential. Its constants apply to all pairs, or to one pair of species."""
 
     if TYPE_CHECKING:
         kind: str
@@ -97,7 +96,7 @@ class PairPotentialTable(TomlTable):
 
 
 def _pair_table(name: str, kind: str, row: type[TomlTable], description: str) -> Any:
-    """Create the schema of a pair potential with one set of constants, or one set per pair of species."""
+    """Create the schema of a pair potential."""
     columns: dict[str, Any] = {"kind": (Literal[kind], ...)}
     for key, field in row.model_fields.items():
         value: Any = Annotated[field.annotation, *field.metadata]
@@ -118,7 +117,7 @@ SoftSphereTable = _pair_table(
 
 
 class ManyBodyTable(TomlTable):
-    """A potential that is not a sum over pairs, and that includes its own cutoff."""
+    """A many-body potential with its own cutoff."""
 
     if TYPE_CHECKING:
         kind: str
@@ -147,7 +146,7 @@ class EmbeddedAtomTable(ManyBodyTable):
 
 
 class PythonTable(PairPotentialTable):
-    """A pair potential u(r, ...) or u(r2, ...) from a Python file that is executed only with permission."""
+    """A pair potential u(r, ...) or u(r2, ...) in a Python file, which is executed only with permission."""
 
     kind: Literal["python"]
     function: str = Field(description='file and name, "mine.py:morse", relative to this file')
@@ -172,7 +171,7 @@ def _kinds(*tables: type[TomlTable]) -> list[str]:
 
 
 def _other_than(*tables: type[TomlTable]) -> Any:
-    """Return the type of the key `kind` in tables of potentials or integrators from other packages."""
+    """Return the type of the key `kind` in tables of other packages."""
     return Field(json_schema_extra={"not": {"enum": [*_kinds(*tables)]}})
 
 
@@ -184,7 +183,7 @@ class OtherRow(TomlTable):
 
 
 class OtherTable(PairPotentialTable):
-    """A pair potential from another package; the keys of the table are the fields of its class."""
+    """A pair potential from another package. Its keys are the fields of its class."""
 
     model_config = ConfigDict(extra="allow")
     __pydantic_extra__: dict[str, float]
@@ -212,7 +211,7 @@ def _check_names(given: Mapping[str, Any], known: Sequence[str]) -> None:
 
 
 def _or_other(tables: Sequence[type[TomlTable]], other: type[TomlTable], registry: str) -> Any:
-    """Return a union type of tables selected by kind, including a table for kinds from other packages."""
+    """Return a union type of tables by kind, including kinds of other packages."""
     tags = dict(zip(_kinds(*tables), tables, strict=True))
 
     def kind_of(value: Any) -> Any:
@@ -259,17 +258,17 @@ class CutoffTable(TomlTable):
 
     @property
     def switches(self) -> bool:
-        """True if this kind of cutoff has a switching function, which begins at the onset."""
+        """True if this cutoff has a switching function."""
         return _switches(self.kind)
 
     @property
     def base(self) -> float | None:
-        """Cutoff radius with which the onset is compared, as a length or a multiple of sigma."""
+        """Cutoff radius to compare the onset with, as a length or a multiple of sigma."""
         return self.radius if self.radius is not None else self.in_sigma
 
     @staticmethod
     def foreign_keys(table: Mapping[str, Any]) -> set[str]:
-        """Return the keys of a cutoff table that do not apply to the kind of cutoff in this table."""
+        """Return the keys of a cutoff table that its kind does not have."""
         kind = table.get("kind")
         return set() if _switches(kind) else {"onset"}
 
@@ -358,7 +357,7 @@ Structure = Annotated[
 
 
 class RebuildTable(TomlTable):
-    """The rule by which the neighbor list is rebuilt, with the options of LAMMPS's neigh_modify."""
+    """The rule of list rebuilds, with the options of LAMMPS's neigh_modify."""
 
     every: int = Field(default=1, ge=1, description="consider a rebuild every so many steps")
     delay: int = Field(
@@ -457,7 +456,7 @@ _DYNAMICS = (NVETable, LangevinTable, NoseHooverTable, CSVRTable, MTKTable, Cell
 
 
 class OtherDynamics(_Dynamics):
-    """An integrator from another package; the keys of the table are the fields of its class."""
+    """An integrator from another package. Its keys are the fields of its class."""
 
     model_config = ConfigDict(extra="allow")
     __pydantic_extra__: dict[str, bool | int | float | str]
@@ -482,7 +481,7 @@ Dynamics = _or_other(_DYNAMICS, OtherDynamics, _INTEGRATORS)
 
 
 class DynamicsAlone(TomlTable):
-    """The dynamics table of a simulation that is made from objects and not from a system file."""
+    """The dynamics table of a simulation made from objects."""
 
     dynamics: Dynamics
 
@@ -515,7 +514,7 @@ class PrecisionTable(TomlTable):
 
 
 class ForkTable(TomlTable):
-    """Options of `mdnum fork` for this system, used if they are not given on the command line."""
+    """Options of `mdnum fork` for this system. The command line overrides them."""
 
     vary: str | None = Field(
         default=None,
@@ -530,7 +529,7 @@ class ForkTable(TomlTable):
 
 
 class RecordTable(TomlTable):
-    """Data that a run records in addition to time series, flips and list rebuilds."""
+    """Data that a run records besides time series, flips and list rebuilds."""
 
     save_every: int = Field(
         default=0, ge=0, description="write a trajectory frame every so many steps; 0: none"
@@ -557,7 +556,7 @@ def check_interaction(potential: Any, cutoff: CutoffTable | None) -> None:
 
 
 class TermTable(TomlTable):
-    """A pair potential with its cutoff, as a term in a sum of pair potentials."""
+    """A pair potential with its cutoff, for a sum of potentials."""
 
     potential: Potential
     cutoff: CutoffTable | None = None
@@ -582,7 +581,7 @@ def _with_onset(cutoff: CutoffTable | None) -> CutoffTable | None:
 
 
 def _one_of(made: dict[str, Any]) -> None:
-    """In the JSON schema, replace the type "table or null" by "table", which editors handle better."""
+    """In the JSON schema, replace the type "table or null" by "table", for editors."""
     made |= made.pop("anyOf")[0]
 
 
@@ -620,14 +619,14 @@ class SystemSpec(TomlTable):
 
     @property
     def interactions(self) -> dict[str, Interaction]:
-        """Potential and cutoff of each term, by name; a single potential has the name ""."""
+        """Potential and cutoff of each term by name. A single potential has the name ""."""
         if self.terms is None:
             return {"": Interaction(self.potential, self.cutoff)}
         return {name: Interaction(one.potential, one.cutoff) for name, one in self.terms.items()}
 
     @property
     def compare(self) -> str:
-        """Comparison that defines whether a pair is inside the cutoff, such as "r2 <"."""
+        """Comparison for pairs inside the cutoff, such as "r2 <"."""
         return next((one.cutoff.compare for one in self.interactions.values() if one.cutoff), "r <")
 
     @property
@@ -650,7 +649,7 @@ class SystemSpec(TomlTable):
 
     @staticmethod
     def follow(data: dict[str, Any], values: Mapping[Key, Any]) -> None:
-        """Request new random velocities for an NVE system if its temperature or seed is changed."""
+        """Request new random velocities for an NVE system with a new temperature or seed."""
         structure, dynamics = data.get("structure"), data.get("dynamics")
         if not isinstance(structure, dict) or not isinstance(dynamics, dict) or dynamics.get("kind") != "nve":
             return

@@ -1,4 +1,4 @@
-"""Trial calls of a user's energy function at one configuration, with equivalent neighbor lists.
+"""Trial calls of a user's energy function at one configuration.
 
 One compiled function computes energy and derivatives. Another function computes only the energy, for a list
 with more padding. The functions are compiled with few optimizations, because they are rarely called.
@@ -34,7 +34,7 @@ _MORE = 8
 
 
 class AdmissionError(InputError):
-    """Error for an energy function that cannot be simulated, with reason (`code`) and numbers (`values`)."""
+    """Error for an energy function that cannot be simulated, with its reason (`code`) and `values`."""
 
     def __init__(self, code: str, name: str, **values: Any):
         entry = _TEXTS[code]
@@ -43,7 +43,7 @@ class AdmissionError(InputError):
 
 
 class Trial:
-    """Trial calls of an energy function at one configuration, with atoms in the order of the structure.
+    """Trial calls of an energy function at one configuration.
 
     Args:
         atoms: number of atoms in the trial: those closest to the first atom, in the box of the whole
@@ -103,7 +103,7 @@ class Trial:
     # --- the programs ---------------------------------------------------------------------------------
 
     def _lists(self) -> None:
-        """Find the list format of the energy function, with or without self-pairs; initialize parameters."""
+        """Find the list format of the energy function. Initialize its parameters."""
         model, lists, own = self.model, self.model.lists, None
         if lists is not None:
             for x in (self.x / self.call.length, self.x @ np.linalg.inv(self.cell)):
@@ -130,7 +130,7 @@ class Trial:
             self.model = replace(model, parameters=model.start(key, x, own))
 
     def bare(self, parameters, x, idx, real, cell, box, strain, code):
-        """Call the energy function in its calling convention; return the energy in the function's unit."""
+        """Call the energy function in its calling convention. The energy is in its unit."""
         call, model = self.call, self.model
         neighbor = jaxmd.as_neighbor_list(idx, real, model.format, model.self_edges, code)
         if call.how.images:
@@ -138,7 +138,7 @@ class Trial:
         return call.bare(parameters, x, neighbor, {"cell": cell, "box": box, "perturbation": strain})
 
     def arguments(self, idx=None, x=None, cell=None, code=0) -> tuple[Any, ...]:
-        """Convert positions and box to arguments of the energy function, in its calling convention."""
+        """Convert positions and box to arguments of the energy function."""
         call, how = self.call, self.call.how
         idx, x, cell = (
             own if one is None else one for one, own in ((idx, self.inside), (x, self.x), (cell, self.cell))
@@ -151,7 +151,7 @@ class Trial:
         return (self.model.parameters, *map(jnp.asarray, given))
 
     def _compile(self) -> None:
-        """Find a list format and keywords that the function accepts, and compile energy and derivatives."""
+        """Find a list format and keywords for the function. Compile energy and derivatives."""
         formats = FORMATS if self.model.format == "any" else (self.model.format,)
         words, failed = self.call.how.keywords, ""
         # a space of jax-md may raise at a keyword that the function passes on
@@ -172,7 +172,7 @@ class Trial:
         raise self.error("NOT_CALLABLE", error=failed, tried=", ".join(formats))
 
     def _returned(self) -> str:
-        """Return the kind of result that the energy function returns: a value of `Convention.returns`."""
+        """Return the kind of result of the energy function: a value of `Convention.returns`."""
         shape = jax.tree.map(lambda one: one.shape, jax.eval_shape(self.bare, *self.arguments()))
         one = ((), (1,))
         if isinstance(shape, Mapping):
@@ -185,7 +185,7 @@ class Trial:
 
     @cached_property
     def _alone(self) -> tuple[Any, Any]:
-        """The energy function compiled for a neighbor list with more padding, and its traced operations."""
+        """The energy function compiled for more padding, and its traced operations."""
         traced = jax.jit(self.bare).trace(*self.arguments(self._padded(self.inside)))
         return _quick(traced), traced.jaxpr
 
@@ -208,12 +208,12 @@ class Trial:
         return float(energy) * call.unit, -np.asarray(slope) @ by_x * call.unit
 
     def energy(self, x=None, idx=None, cell=None) -> float:
-        """Compute only the energy, in a quarter of the time that energy and forces take together."""
+        """Compute only the energy, in a quarter of the time of energy and forces."""
         idx = self._padded(self.inside if idx is None else idx)
         return float(self._alone[0](*self.arguments(idx, x, cell))) * self.call.unit
 
     def without_itself(self) -> float:
-        """Compute the energy with a list in which no atom is its own neighbor."""
+        """Compute the energy with a list without self-pairs."""
         model, arguments = self.model, self.arguments()
         self.model = replace(model, self_edges=False)
         # not the method, whose earlier trace would be taken
@@ -227,17 +227,17 @@ class Trial:
         return np.where(near, idx, self.n).astype(np.int32)
 
     def distances(self, idx, x) -> Float[np.ndarray, "atoms slots"]:
-        """Return the distances of all pairs in a neighbor list; values for padding entries are arbitrary."""
+        """Return the distances of all pairs in a list. Those of padding are arbitrary."""
         d = displacement(self.box, x[:, None], x[np.minimum(idx, self.n - 1)])
         return np.sqrt(sum(c * c for c in d))
 
     def culprit(self, idx) -> str:
-        """Return the first operation with an infinite or NaN result in the energy or its derivative."""
+        """Return the first operation with an infinite or NaN result."""
         return named(first_not_finite(jax.value_and_grad(self.bare, 1), *self.arguments(idx)))
 
 
 def _quick(traced: Any) -> Any:
-    """Compile a traced function with few optimizations, because it is called only a few times."""
+    """Compile a traced function with few optimizations, for a few calls."""
     return traced.lower().compile(compiler_options={"xla_backend_optimization_level": 0})
 
 

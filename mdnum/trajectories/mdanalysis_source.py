@@ -1,9 +1,9 @@
-"""Trajectories read by MDAnalysis, and detection of data after the last frame that MDAnalysis reads.
+"""Trajectories read by MDAnalysis, and data that MDAnalysis does not read.
 
-MDAnalysis's readers of dcd, trr and some text formats take a truncated or damaged frame for the end of the
-file, and silently skip the remaining data. If the last number of a text file is truncated, the remaining
-digits are read as a different number. If a run is killed, its Amber NetCDF file has fewer records than its
-header states. MDAnalysis rejects such a file; this module reads it (ambermd.org/netcdf/nctraj.xhtml).
+MDAnalysis takes a damaged frame of dcd, trr and some text formats for the end of the file. It skips the
+remaining data silently. The digits of a truncated last number in a text file are read as a different number.
+The Amber NetCDF file of a killed run has fewer records than its header states. MDAnalysis rejects such a
+file; this module reads it (ambermd.org/netcdf/nctraj.xhtml).
 """
 
 from __future__ import annotations
@@ -71,7 +71,7 @@ class LibraryFrames:
         self._guard = opened(trajectory)
 
     def timestep(self, number: int, forward: bool = False) -> Any:
-        """Return MDAnalysis's timestep of a frame; set `forward` if the reader is at the previous frame.
+        """Return MDAnalysis's timestep of a frame. Set `forward` if the reader is at the previous frame.
 
         Raises:
             UnreadableFrame: the frame is unreadable, would crash the process, or ends with a truncated
@@ -99,7 +99,7 @@ class LibraryFrames:
             return ts
 
     def frame(self, ts: Any, number: int, untimed: bool = False) -> Frame:
-        """Return a `Frame` with copies of a timestep's data; errors are raised as in `timestep`."""
+        """Return a `Frame` with copies of a timestep's data. Errors are those of `timestep`."""
         with self._reading(number):
             time, x = float(number) if untimed else float(ts.time), np.array(ts.positions, np.float64)
             velocities = np.array(ts.velocities, np.float64) if ts.has_velocities else None
@@ -115,7 +115,7 @@ class LibraryFrames:
         return reading(file_of(self.trajectory) or "the trajectory", number)
 
     def _refuse_cut_text(self, number: int) -> None:
-        """Reject the last frame of a text file if its last number is truncated."""
+        """Reject the last frame of a text file with a truncated last number."""
         trajectory = self.trajectory
         if number != trajectory.n_frames - 1 or (found := _text(trajectory)) is None:
             return
@@ -161,7 +161,7 @@ class MDAnalysisTrajectory(Trajectory):
             return self._boxes.other(self.universe.trajectory[number], number)
 
     def _universe_of(self, format: str | None) -> tuple[Any, list[str]]:
-        """Return a Universe of the trajectory, and the warnings from opening it and reading the time step."""
+        """Return a Universe of the trajectory, and the warnings of its reader."""
         import MDAnalysis
 
         path = self.path
@@ -213,9 +213,9 @@ class MDAnalysisTrajectory(Trajectory):
 
 
 def labels_of(trajectory: Any) -> Callable[[int], np.ndarray | None]:
-    """Return a function that reads the atom labels of any frame, not only of the first as MDAnalysis does.
+    """Return a function that reads the atom labels of any frame. MDAnalysis reads only those of the first.
 
-    The function returns None unless the file is an XYZ file or a PDB file with several models.
+    The function returns None except for XYZ files and PDB files with several models.
     """
     from MDAnalysis.lib.util import anyopen
 
@@ -243,7 +243,7 @@ def labels_of(trajectory: Any) -> Callable[[int], np.ndarray | None]:
 
 
 def _length_of(trajectory: Any) -> str:
-    """Return the name of the length unit of positions; "" if the file format does not define it (GSD)."""
+    """Return the name of the length unit. "" if the file format does not define it (GSD)."""
     unit = trajectory.units.get("length")
     if unit is None or getattr(trajectory, "convert_units", True):
         return "Å" if unit else ""
@@ -252,7 +252,7 @@ def _length_of(trajectory: Any) -> str:
 
 
 def _time_factors(trajectory: Any) -> tuple[float, float]:
-    """Return two ratios of DCD time steps: stored / MDAnalysis's value, and byte-swapped / stored value."""
+    """Return two ratios of DCD time steps: stored / MDAnalysis's, and byte-swapped / stored."""
     read = trajectory._file.header["delta"] if "DCD" in formats_of(trajectory) else 0.0
     if not read:
         return 1.0, math.nan
@@ -268,9 +268,9 @@ def _time_factors(trajectory: Any) -> tuple[float, float]:
 
 
 def left_over(trajectory: Any) -> str | None:
-    """Describe data after the last frame that MDAnalysis finds in a file; return None if there are none.
+    """Describe data after the last frame of MDAnalysis. None if there are none.
 
-    If the file is line-based text, the MDAnalysis reader is moved to its last frame.
+    In line-based text, the MDAnalysis reader is moved to its last frame.
     """
     path = file_of(trajectory)
     if path is None or not path.is_file():
@@ -307,7 +307,7 @@ def left_over(trajectory: Any) -> str | None:
 
 
 def _behind_dcd(path: Path, frames: int) -> tuple[int, int]:
-    """Return (number of bytes after the last frame of a DCD file, size of a frame in bytes)."""
+    """Return (bytes after the last frame of a DCD file, bytes of a frame)."""
     from MDAnalysis.lib.formats.libdcd import DCDFile
 
     with DCDFile(str(path)) as file:
@@ -320,7 +320,7 @@ def _behind_dcd(path: Path, frames: int) -> tuple[int, int]:
 
 
 def _behind_text(file: Any) -> str | None:
-    """Describe lines after a text file's last frame, except trailing blank lines; None if there are none."""
+    """Describe lines after the last frame of a text file, except blank lines. None if there are none."""
     if file is None or file.closed:
         return None
     lines = 0
@@ -333,7 +333,7 @@ def _behind_text(file: Any) -> str | None:
 
 
 def _last_bytes(path: Path) -> tuple[bytes, int]:
-    """Return (last bytes of a file, its size); a compressed file is decompressed completely."""
+    """Return (last bytes of a file, its size). A compressed file is decompressed."""
     from MDAnalysis.lib.util import anyopen
 
     packed = path.suffix in (".gz", ".bz2")
@@ -347,7 +347,7 @@ def _last_bytes(path: Path) -> tuple[bytes, int]:
 
 
 def _text(trajectory: Any) -> tuple[Path, str] | None:
-    """Return (path, format) if MDAnalysis reads the file as lines of text; otherwise return None."""
+    """Return (path, format) if MDAnalysis reads the file as lines of text, else None."""
     path, word = file_of(trajectory), next((one for one in formats_of(trajectory) if one in _LINES), None)
     return None if word is None or path is None else (path, word)
 
@@ -356,7 +356,7 @@ def _text(trajectory: Any) -> tuple[Path, str] | None:
 
 
 class NetcdfFile(netcdf_file):
-    """A NetCDF file in classic format, whose complete records can be read even if the header is wrong."""
+    """A classic NetCDF file. Its complete records can be read even with a wrong header."""
 
     # where the first record begins, bytes
     _begin = sys.maxsize
@@ -374,7 +374,7 @@ class NetcdfFile(netcdf_file):
 
     @property
     def told(self) -> int:
-        """Number of records stated in the header; -1 if the program that wrote the file never set it."""
+        """Number of records in the header. -1 if it was never set."""
         return int(vars(self)["_recs"])
 
     @property
@@ -397,7 +397,7 @@ class NetcdfFile(netcdf_file):
 
 
 def netcdf_of(path: str | Path) -> NetcdfFile | None:
-    """Open a NetCDF file in classic format; return None for other formats or a truncated header."""
+    """Open a classic NetCDF file. Return None for other formats or a truncated header."""
     try:
         file = NetcdfFile(str(path))
     except (OSError, TypeError, ValueError, KeyError, IndexError):
@@ -452,7 +452,7 @@ class NetcdfTrajectory(Trajectory):
 
 
 def _scaled(variable: Any, number: int) -> np.ndarray:
-    """Return the value of a NetCDF variable in a record, multiplied by the scale factor of the variable."""
+    """Return the value of a NetCDF variable in a record, times its scale factor."""
     values, scale = np.array(variable[number]), getattr(variable, "scale_factor", None)
     values = values.astype(values.dtype.newbyteorder("="))
     # rounded once, as MDAnalysis does

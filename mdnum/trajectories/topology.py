@@ -1,17 +1,17 @@
-"""Atoms and boxes from MDAnalysis and ASE: names, elements, residues, and boxes in their stored orientation.
+"""Atoms and boxes from MDAnalysis and ASE.
 
-MDAnalysis stores three lengths and three angles of a box, and assumes (like most programs) that the first
-vector is along x and the second in the xy plane. For a box in another orientation, the periodic images
-computed from MDAnalysis's box are silently wrong:
+MDAnalysis stores three lengths and three angles of a box. It assumes that the first vector is along x and the
+second in the xy plane. For boxes in other orientations, the periodic images from MDAnalysis are silently
+wrong:
 
-- CHARMM (since version 22) writes symmetric box matrices to dcd files, which do not state the orientation.
-- HOOMD's boxes have tilt factors, which MDAnalysis interprets as cosines of angles (in gsd files).
-- Boxes in H5MD files and DL_POLY's HISTORY files may have vectors in any direction.
+- CHARMM (since version 22) writes symmetric box matrices to dcd files. They have no orientation.
+- MDAnalysis takes the tilt factors of HOOMD's boxes for cosines of angles (gsd files).
+- Boxes in H5MD and DL_POLY HISTORY files may have vectors in any direction.
 
-In a PDB file with many models, MDAnalysis ignores or misassigns CRYST1 records outside the models. Programs
-write CRYST1 once in the header (OpenMM), before each model (GROMACS), or inside each model. MDAnalysis reads
-a model from its MODEL record to the next MODEL record. MDAnalysis therefore never reads a box before the
-first model, and assigns a box between two models to the first of the two instead of the second.
+MDAnalysis also ignores or misassigns CRYST1 records outside the models of a PDB file. Programs write CRYST1
+in the header (OpenMM), before each model (GROMACS), or inside each model. MDAnalysis reads a model from its
+MODEL record to the next MODEL record. MDAnalysis therefore never reads a box before the first model. A box
+between two models is assigned to the first of the two.
 """
 
 from __future__ import annotations
@@ -76,7 +76,7 @@ class AtomTable:
 
     @property
     def columns(self) -> dict[str, np.ndarray]:
-        """Atom names, residue names and numbers, and segments, by column name; empty columns are omitted."""
+        """Names and numbers of atoms, residues and segments by column. Empty columns are omitted."""
         numbered = any(self.residue_names) or self.residues.any()
         every = {
             "atom_name": self.names if self.named else (), "residue_name": self.residue_names,
@@ -167,13 +167,13 @@ class AtomTable:
 
 @dataclass(frozen=True)
 class Topology:
-    """A file that identifies the atoms: any topology or structure that MDAnalysis or ASE can read."""
+    """A file that identifies the atoms, in a format of MDAnalysis or ASE."""
 
     path: Path
     otherwise: Callable[[Path], AtomTable]  # the atoms of a file that MDAnalysis does not read
 
     def read(self) -> tuple[AtomTable, Any]:
-        """Return the atom table of the file, and an MDAnalysis Universe of the atoms without coordinates.
+        """Return the atom table of the file, and a Universe without coordinates.
 
         Raises:
             InputError: no reader supports the file.
@@ -191,7 +191,7 @@ class Topology:
 
 
 def topology_universe(topology: str | Path) -> Any:
-    """Return an MDAnalysis Universe of a topology file, without coordinates; no index file is written.
+    """Return a Universe of a topology file, without coordinates. No index file is written.
 
     Raises:
         InputError: MDAnalysis cannot read the file.
@@ -205,7 +205,7 @@ def topology_universe(topology: str | Path) -> Any:
 
 
 def atoms_in(path: str | Path, topology: int | None = None, format: str | None = None) -> int | None:
-    """Return the number of atoms in a trajectory; None if neither the file nor the topology gives it."""
+    """Return the number of atoms in a trajectory. None if it is not known."""
     from MDAnalysis.core._get_readers import get_reader_for
 
     for known in ({}, {"n_atoms": topology}):
@@ -227,13 +227,13 @@ def formats_of(trajectory: Any) -> list[str]:
 
 
 def file_of(trajectory: Any) -> Path | None:
-    """Return the path of the file behind an MDAnalysis reader; None if there is no single file."""
+    """Return the path of the file of an MDAnalysis reader. None without a single file."""
     path = getattr(trajectory, "filename", None)
     return Path(path) if isinstance(path, str | Path) else None
 
 
 class Boxes:
-    """Boxes of an MDAnalysis reader, in the same orientation as the coordinates in the file.
+    """Boxes of an MDAnalysis reader, in the orientation of the file.
 
     Attributes:
         notes: sentences for the user on the interpretation of the boxes.
@@ -268,7 +268,7 @@ class Boxes:
         return ("BOX_NOT_MDANALYSIS", theirs) if differs else None
 
     def box(self, ts: Any, number: int) -> Box:
-        """Return the box of a frame, given its MDAnalysis Timestep object and its number."""
+        """Return the box of a frame, from its MDAnalysis Timestep and its number."""
         dimensions = ts.dimensions
         # transformations may have set another
         if self._models and (dimensions is None or not self._changed):
@@ -280,12 +280,11 @@ class Boxes:
 
 
 def box_of(dimensions: Float[np.ndarray, "6"] | None) -> Box:
-    """Return the box for given lengths (Å) and angles (degrees), with a along x and b in the xy plane.
+    """Return the box of given lengths (Å) and angles (degrees). a is along x, b in the xy plane.
 
     `None` means no box. An axis of length 0 is not periodic if all angles are 90°.
 
-    Error: lattice vectors have a relative error of 1e-7, since MDAnalysis stores lengths and angles in
-        float32.
+    Error: the relative error of lattice vectors is 1e-7, since MDAnalysis stores float32.
     """
     from MDAnalysis.lib.mdamath import triclinic_vectors
 
@@ -360,7 +359,7 @@ _MATRICES = {"DCD": _dcd, "GSD": _hoomd, "H5MD": _h5md, "HISTORY": _dlpoly}
 
 @lru_cache(maxsize=4)
 def _models(path: str, size: int, changed: int) -> tuple[tuple[Dimensions, ...], int]:
-    """Return lengths and angles of each model's box, and the number of CRYST1 records; both are cached."""
+    """Return lengths and angles of each model's box, and the number of CRYST1 records. Cached."""
     from MDAnalysis.lib.util import anyopen
 
     found: list[Dimensions] = []

@@ -34,7 +34,7 @@ _COLUMNS = ("step", "i", "j", "entered", "distance", "margin", "radial_speed", "
 
 
 class RunView(View):
-    """Read access to the folder of a run, whether the run is finished or not."""
+    """Read access to the folder of a run, finished or not."""
 
     @cached_property
     def series(self) -> Mapping[str, np.ndarray]:
@@ -56,7 +56,7 @@ class RunView(View):
 
     @cached_property
     def flips(self) -> analysis.Scan:
-        """Statistics of all flips; the table of flips is read in batches because of its size."""
+        """Statistics of all flips. The table of flips is read in batches."""
         flips = analysis.Scan(len(self.series["step"]), TABLE_ROWS)
         known = self.folder.table("flips", rows=1).column_names
         columns = [*_COLUMNS, *(name for name in ("terms",) if name in known)]
@@ -73,12 +73,12 @@ class RunView(View):
 
     @property
     def cutoff(self) -> Mapping[str, Any]:
-        """Properties of the cutoff, such as its kind, radius and energy jump; empty if there is no cutoff."""
+        """Properties of the cutoff, such as kind, radius and energy jump. Empty without a cutoff."""
         return self.summary.get("cutoff") or {}
 
     @property
     def cutoff_key(self) -> str:
-        """Key of the system file that sets the cutoff; empty if the potential sets the cutoff."""
+        """Key of the system file that sets the cutoff. Empty if the potential sets it."""
         given = self.system.get("cutoff") or {}
         return next((f"cutoff.{key}" for key in ("radius", "in_sigma", "pairs") if key in given), "")
 
@@ -94,7 +94,7 @@ class RunView(View):
 
     @property
     def jump(self) -> float:
-        """Energy of a pair at the cutoff distance; 0 if the potential is zero there."""
+        """Energy of a pair at the cutoff. 0 if the potential vanishes there."""
         return float(self.cutoff.get("energy_jump") or 0.0)
 
     @property
@@ -109,12 +109,12 @@ class RunView(View):
 
     @cached_property
     def expected_ambiguous(self) -> float:
-        """Expected number of flips whose margin is at most the rounding bound of the margin."""
+        """Expected number of flips with a margin within its rounding bound."""
         return analysis.expected_ambiguous(self.flips.ratios)
 
     @cached_property
     def budget(self) -> dict[str, np.ndarray]:
-        """By step: change of the conserved energy, sum of the energy jumps at flips, and change minus sum."""
+        """By step: change of the conserved energy, sum of energy jumps at flips, and their difference."""
         conserved = self.series["conserved"]
         change, jumps = conserved - conserved[0], np.cumsum(self.series["energy_jump"])
         return {"change": change, "jumps": jumps, "residual": change - jumps}
@@ -123,10 +123,10 @@ class RunView(View):
     def time_step(self) -> dict[str, float | None]:
         """Indicators of whether the time step is small enough; unknown indicators are None.
 
-        `per_period` is the number of steps per period of the fastest vibration in the first and the last
-        frame. `fluctuation` is the fluctuation of the conserved energy (without the energy jumps at flips)
-        divided by that of the kinetic energy. `drift` and `drift_error` are the drift of the conserved energy
-        over the whole run and its standard error, in k_B T per atom.
+        `per_period` is the number of steps per period of the fastest vibration, in the first and the last
+        frame. `fluctuation` is the fluctuation of the conserved energy without jumps, divided by that of the
+        kinetic energy. `drift` and `drift_error` are the energy drift over the run and its standard error, in
+        k_B T per atom.
         """
         period, step = self.summary.get("fastest_period"), (self.system.get("dynamics") or {}).get("timestep")
         atoms = self.summary.get("atoms") or 0
@@ -146,13 +146,13 @@ class RunView(View):
 
     @property
     def residual(self) -> Measured:
-        """Stored residual of the energy budget or, if missing, max |E(t) - E(0) - sum of energy jumps|."""
+        """Stored residual of the energy budget, or max |E(t) - E(0) - sum of energy jumps|."""
         stated = self.summary.get("energy_budget_residual")
         left = float(np.max(np.abs(self.budget["residual"]))) if stated is None else abs(float(stated))
         return Measured(left, self.units.energy, self.summary.get("energy_budget_tolerance"))
 
     def total(self, key: str, column: str | None = None) -> int:
-        """Return a number of events, such as lost pairs, from the summary or summed over neighbor lists."""
+        """Return a number of events, such as lost pairs, from the summary or the neighbor lists."""
         return int(self.summary.get(key) or self.epochs[column or key].sum())
 
     def step(self, row: int | np.integer) -> int:
@@ -185,7 +185,7 @@ def page(run: RunView, verdict: Verdict) -> Page:
 
 
 def draw_first(run: RunView) -> None:
-    """Draw, in parallel with other work, the figures for which the table of flips is not needed."""
+    """Draw the figures that do not need the table of flips, in parallel with other work."""
     from mdnum.report import drawing
 
     for part in (*_energy(run), next(_flips_per_step(run)), *_lists(run)):
@@ -209,7 +209,7 @@ def _numbers(run: RunView) -> dict[str, Any]:
 
 
 def _what(run: RunView) -> list[tuple[str, str]]:
-    """Return table rows on the simulated system; settings that the system file lacks are omitted."""
+    """Return table rows on the simulated system. Missing settings are omitted."""
     units, system, time = run.units, run.system, run.series["time"]
     lengths: dict[str, str] = dict.fromkeys(("radius", "onset", "skin"), units.length)
 
@@ -297,7 +297,7 @@ def _energy(run: RunView) -> Iterator[Any]:
 
 
 def _pressure(run: RunView) -> Iterator[Any]:
-    """Yield the contributions to the pressure, such as the kinetic part and the virial part."""
+    """Yield the contributions to the pressure, such as the kinetic part."""
     units, parts = run.units, run.summary.get("pressure")
     if not parts:
         return
@@ -432,7 +432,7 @@ def _lists(run: RunView) -> Iterator[Any]:
 
 
 def _nearest(run: RunView) -> Iterator[Any]:
-    """Yield a table of the flips with the smallest margins to the cutoff, ordered by step."""
+    """Yield a table of the flips with the smallest margins, by step."""
     flips, units = run.flips.nearest, run.units
     if not len(flips["step"]):
         yield TEXTS("no_flips")
@@ -443,7 +443,7 @@ def _nearest(run: RunView) -> Iterator[Any]:
 
 
 def _ranges(run: RunView) -> Iterator[Any]:
-    """Yield a table of each quantity's range, and of the first step outside the range of narrower formats."""
+    """Yield a table of the range of each quantity, and when it leaves narrower formats."""
     examined, series, units = run.table("ranges"), run.series, vars(run.units)
     sums = columns({name: series[name][:, None] for name in ("potential", "kinetic")})
     sums["step"] = series["step"]

@@ -1,4 +1,4 @@
-"""Registry of all calculator checks in the modules of this package and in plugins."""
+"""Registry of calculator checks, here and in plugins."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Write a failing test case as a Python script that compares a neighbor list with brute force."""
+"""Write a failing test case as a Python script with a brute-force search."""
 
 from __future__ import annotations
 
@@ -31,10 +31,10 @@ _LINES = beside(__file__)  # parts of a script
 def script(
     tested: PairList, failed: Failed, how: Conventions, superset: bool = False, reach: float | None = None
 ) -> str:
-    """Return a script that calls the neighbor list for a failing test case and checks it by brute force.
+    """Return a script that checks the neighbor list by brute force for a test case.
 
-    The script requires only numpy and the neighbor list. The script prints the error and exits with status 1,
-    or with 0 if the neighbor list is correct. The script does not catch the neighbor list's exceptions.
+    The script requires only numpy and the neighbor list. The script prints the error and exits with status 1.
+    The status is 0 if the list is correct. The script does not catch the neighbor list's exceptions.
 
     Args:
         how: conventions of the neighbor list.
@@ -69,7 +69,7 @@ def script(
 
 
 def _numbers(failed: Failed, how: Conventions, reach: float) -> str:
-    """Return the numbers of a failing test case as constants in Python source code."""
+    """Return the numbers of a test case as Python source code."""
     case, stills = failed.case, []
     several = any(other.skin is not None for other in case.stills)
     for still, fresh, skin in _calls(case):
@@ -100,7 +100,7 @@ def _numbers(failed: Failed, how: Conventions, reach: float) -> str:
 
 
 def _calls(case: Case) -> Iterator[tuple[Still, bool, float]]:
-    """Yield positions and cell of each call, whether a new list is built, and the skin of the list."""
+    """Yield positions and cell of each call, whether a new list is built, and the skin."""
     atoms = None
     for still in case.stills:
         count = len(still.positions)
@@ -118,7 +118,7 @@ _SECONDS = 60.0  # seconds that a script may take
 
 
 def reproduces(report: Report, failed: Failed, deadline: Deadline) -> bool | None:
-    """Run the script of a failure; return whether the failure appears, or None if a time limit is reached."""
+    """Run the script of a failure. Return whether the failure appears, or None after a time limit."""
     tested, code, text = report.tested, failed.code, failed.worst.text
     if not tested.source.strip() or deadline.passed:
         return None
