@@ -29,6 +29,28 @@ REGISTRIES = (
     ("Measures of a sweep", "mdnum.verbs.sweep_measures:MEASURES", "`mdnum sweep --measure`"),
     ("Neighbor lists", "mdnum.references.conformance.lists:LISTS", "`mdnum conform`"),
 )
+#: Fields of findings that hold whole sentences: by command, the names of these sentences in its text file.
+FILLED = {
+    "fork map": {"away": ("above", "below", "far_above", "far_below")},
+    "grad": {
+        "seen": (
+            "rounding_disagree", "time_step_disagree", "standard_error_scatter",
+            "near_miss_short_of", "near_miss_beyond", "near_miss_elsewhere", "near_miss_between_two_steps",
+            "flips_left_out_steps_alone", "flips_left_out_single_frames", "flips_left_out_grazing",
+            "ambiguous_decision_within_rounding",
+        ),
+    },
+    "flips": {"seen": ("stride_seen",)},
+    "conform": {"seen": ("failure",), "also": ("answers",)},
+    "ball": {"told": ("fork",)},
+}  # fmt: skip
+#: What such a field holds if it is not made of sentences of a text file.
+HELD = {
+    "error": "The error message of the run is shown.",
+    "note": "The reason why energies were not compared is shown.",
+    "notes": "Notes on how the file was read are shown.",
+    "each": "Each of these methods is listed, with the reason why it gave no gradient.",
+}
 _CODE = re.compile(r"[A-Z][A-Z0-9_]+")
 _UNIT = re.compile(r"\s*\(([^()]*(?:Å|σ|eV|ps|GPa|1/|τ|ε|amu|\bm\b)[^()]*)\)")
 
@@ -147,6 +169,19 @@ def _sentence(text: str) -> str:
     return _text(filled).replace("\x00", "*").replace("**", "* *")
 
 
+def _filled(verb: str, text: str) -> list[str]:
+    """Return a sentence in each of its forms, if one of its fields holds whole sentences."""
+    from mdnum.verbs import declared
+
+    if text[1:-1] in HELD:
+        return [HELD[text[1:-1]]]
+    for field, names in FILLED.get(verb, {}).items():
+        if f"{{{field}}}" in text:
+            sentences = declared(verb)["sentences"]
+            return [text.replace(f"{{{field}}}", sentences[name]) for name in names]
+    return [text]
+
+
 def anchor(verb: str, code: str) -> str:
     """Return the anchor of a finding on its page."""
     return f"{verb} {code}".lower().replace(" ", "-").replace("_", "-")
@@ -219,7 +254,8 @@ def findings_page() -> str:
             for part, title in (("title", ""), ("text", "What was seen"), ("remedy", "What to do")):
                 said = [text for name, text in entry.items() if name == part or name.startswith(f"{part}_")]
                 said += [text for name, text in entry.items() if part == "text" and name.startswith("more_")]
-                said = list(dict.fromkeys(_sentence(text) for text in said if text and text != "{remedy}."))
+                said = [one for text in said if text != "{remedy}." for one in _filled(verb, text)]
+                said = list(dict.fromkeys(_sentence(text) for text in said if text))
                 begin = f"**{entry['severity']}**: " if part == "title" else f"*{title}.* "
                 if len(said) > 1:
                     lines += [begin.rstrip(), "", *(f"- {text}" for text in said), ""]

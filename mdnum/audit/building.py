@@ -54,7 +54,8 @@ def default_structure(loaded: LoadedCalculator, deadline: Deadline | None = None
     this element from a second one, half of the atoms are of the second element. The lattice constant
     minimizes the calculator's energy of the crystal. The crystal is repeated until the cell is two cutoffs
     wide (at most 500 atoms, fewer for a slow calculator), and its atoms are displaced slightly.
-    `info["origin"]` of the returned structure describes how the structure was built. If the calculator fails
+    `info["origin"]` of the returned structure describes how the structure was built, and `info["guessed"]` is
+    True if the calculator names no element. If the calculator fails
     on atoms without neighbors, a denser crystal is built; the failure is reported later.
 
     Args:
@@ -70,10 +71,12 @@ def default_structure(loaded: LoadedCalculator, deadline: Deadline | None = None
     builder = _Builder(loaded, Meter(deadline=deadline or Deadline(), most=BUILDING_CALLS))
     try:
         with interrupting(builder.meter.deadline), builder.meter.limited():
-            return builder.built()
+            made = builder.built()
     except TimeUp as up:
         best = builder.best if builder.best is not None else _filled(*_unit_cell(*builder.likely[:1]))
-        return _labeled(best, f"{best.info['origin']}; {up.why.replace(' of this check', '')}")
+        made = _labeled(best, f"{best.info['origin']}; {up.why.replace(' of this check', '')}")
+    made.info["guessed"] = not builder.named
+    return made
 
 
 def _labeled(atoms: Atoms, origin: str) -> Atoms:

@@ -115,7 +115,10 @@ class NamedObject:
         for name in defaults:
             if hasattr(module, name):
                 return getattr(module, name)
-        names = public(module)
+        values, names = vars(module), public(module)
+        # what a file imports is not suggested, unless it has nothing else
+        own = [name for name in names if getattr(values[name], "__module__", None) == module.__name__]
+        names = own or names
         lacks = f", which has no {' or '.join(defaults)}" if defaults else ", not an object in it"
         has = f"Give {self.home}:{names[0]}. It has {', '.join(names[:8])}" if names else "It has no function"
         raise InputError(f"{self.home} is a file{lacks}", remedy=has)

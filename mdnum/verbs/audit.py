@@ -534,6 +534,8 @@ def _page(view: AuditView, verdict: Verdict) -> Page:
         sections.append(Section(result.title, parts))
     sections.append(Section("What was tested", [pairs(_subject(summary, given))]))
     about = f"{state.name}, {summary['formula']}, {many(summary['atoms'], 'atom')}"
+    if state.atoms.info.get("guessed"):
+        about += f". {TEXTS('guessed', formula=summary['formula'])}"
     return view.page(f"Audit of {state.name}", about, _keys(summary, verdict, given), sections)
 
 

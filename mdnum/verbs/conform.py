@@ -361,7 +361,7 @@ def judge(view: View) -> Verdict:
 
 def _evidence(view: View) -> Iterator[str]:
     summary = view.summary
-    worst = sorted((row for row in summary["areas"] if row["failed"]), key=lambda row: -row["failed"])[:4]
+    worst = sorted((row for row in summary["areas"] if row["failed"]), key=lambda row: -row["failed"])
     if worst:
         areas = [f"{row['area']} ({count(row['failed'])} of {count(row['asked'])})" for row in worst]
         yield TEXTS("where", areas=listed(areas))
@@ -450,9 +450,10 @@ def _conduct(summary: Mapping[str, Any], answered: int) -> Iterator[Finding]:
 def page(view: View, verdict: Verdict) -> Page:
     """Return the report page of an examination."""
     summary = view.summary
-    wrong, kinds = summary["wrong"] - summary["silent"], len(summary["failures"])
+    wrong = summary["wrong"] - summary["silent"]
+    kinds = sum(row["code"] not in SILENT for row in summary["failures"])
     totals = {name: _total(summary, name) for name in ("passed", "skipped")}
-    values = {**summary, **totals, "wrong": wrong, "kinds": kinds if wrong else None}
+    values = {**summary, **totals, "wrong": wrong, "kinds": kinds or None}
     package = f"{summary['package'] or ''} {summary['version'] or ''}".strip()
     what = TEXTS.rows("what", **{
         **summary, "list": summary["about"] or summary["system"], "package": package or None,

@@ -399,7 +399,8 @@ def _chatter(run: RunView) -> Iterator[Any]:
         inside=analysis.median(stays.inside), outside=analysis.median(stays.outside),
     )  # fmt: skip
     yield table_of(busiest.rows(_BUSIEST), {
-        "pair": pair_name, "flips": "flips", "one in … steps": lambda one: run.steps / one["flips"],
+        "pair (counted from 0)": pair_name, "flips": "flips",
+        "one in … steps": lambda one: run.steps / one["flips"],
     }, "Pairs that flip most")  # fmt: skip
 
 

@@ -121,12 +121,14 @@ def test_where_no_atom_feels_another_nothing_is_cleared(tmp_path, kind, atoms):
 def test_silicon_for_a_silicon_potential():
     structure = default_structure(loaded(counted(__doc__="Silicon."), **SILICON))
     assert set(structure.symbols) == {"Si"} and "diamond" in structure.info["origin"]
+    assert not structure.info["guessed"]
 
 
 def test_two_elements_where_a_calculator_tells_them_apart():
     """One that knows a second element has both in its structure, whichever numbers it gives them."""
     assert set(default_structure(loaded(EMT)).symbols) == {"Cu", "Ni"}
-    assert set(default_structure(loaded(LennardJones, sigma=3.4, epsilon=0.01)).symbols) == {"Ar"}
+    argon = default_structure(loaded(LennardJones, sigma=3.4, epsilon=0.01))
+    assert set(argon.symbols) == {"Ar"} and argon.info["guessed"]
     assert set(default_structure(loaded(EAM, potential=str(TABLE))).symbols) == {"Cu"}
     mixed = default_structure(loaded(planted.ByAppearance))
     counts = [int(np.sum(mixed.symbols == one)) for one in ("Ar", "Kr")]

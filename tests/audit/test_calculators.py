@@ -94,6 +94,21 @@ def test_a_mistake_says_what_to_write(words: str, message: str, tmp_path: Path):
     assert message in str(error.value)
 
 
+def test_a_class_of_the_file_is_suggested_and_not_what_it_imports(tmp_path: Path):
+    file = tmp_path / "mine.py"
+    imports = "from ase.calculators.calculator import Calculator\nfrom ase.build import bulk\n"
+    file.write_text(f"{imports}class MyMorse(Calculator):\n    pass\n")
+    with pytest.raises(InputError) as error:
+        load_calculator(str(file))
+    assert f"{file}:MyMorse" in str(error.value)
+    assert not {"bulk", "Calculator", "Calculator,"} & {*str(error.value).split()}
+    # a file that has nothing of its own
+    file.write_text("from ase.calculators.emt import EMT\n")
+    with pytest.raises(InputError) as error:
+        load_calculator(str(file))
+    assert f"{file}:EMT" in str(error.value)
+
+
 class Counting(Calculator):
     """Counts how often it was asked, and can be made to fail."""
 

@@ -58,6 +58,11 @@ def test_every_finding_has_its_entry_with_a_severity_and_a_sentence(pages):
     # a remedy is shown, and what a field holds is a word
     assert "Increase the skin (neighbors.skin)" in page
     assert not re.search(r"\{\w+", page)
+    # a field that holds whole sentences shows these
+    bare = r"^(?:- |\*[A-Z][a-z ]+\.\* |\*\*[a-z]+\*\*: )?\*[\w ]+\*\.?$"
+    assert re.findall(bare, page, re.MULTILINE) == []
+    assert not re.search(r"\*(?:seen|also|away|notes)\*", page)
+    assert re.search(bare, "*What was seen.* *seen*")
 
 
 def test_every_command_and_option_has_its_entry(pages, capsys):
