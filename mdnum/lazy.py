@@ -1,4 +1,4 @@
-"""Deferred import: the names of a package are imported when they are first used (PEP 562)."""
+"""Deferred import: names of a package are imported at first use (PEP 562)."""
 
 from __future__ import annotations
 
@@ -13,10 +13,10 @@ from typing import Any
 def on_first_use(
     package: str, **others: str
 ) -> tuple[Callable[[str], Any], Callable[[], list[str]], list[str]]:
-    """Return `__getattr__`, `__dir__` and `__all__` for a package that imports its names on first use.
+    """Return `__getattr__`, `__dir__` and `__all__` of a package that imports names at first use.
 
-    The names are taken from the imports under `if TYPE_CHECKING` in the source of the package. Imports under
-    `if TYPE_CHECKING` must use full module names. Type checkers and Python therefore use the same names.
+    The names are those imported under `if TYPE_CHECKING` in the package. Imports under `if TYPE_CHECKING`
+    must use full module names. Type checkers and Python therefore use the same names.
 
     Args:
         package: `__name__` of the package.

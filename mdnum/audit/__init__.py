@@ -1,1 +1,1 @@
-"""Audit of any ASE calculator: is it safe to run dynamics with it, and to differentiate it?"""
+"""Audit of any ASE calculator: is it safe for dynamics and for gradients?"""

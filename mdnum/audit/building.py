@@ -1,4 +1,4 @@
-"""Build a test structure from elements that a calculator supports, if no structure is given."""
+"""Test structures from elements that a calculator supports, if no structure is given."""
 
 from __future__ import annotations
 
@@ -48,15 +48,14 @@ _SAME = 1e-9  # of the energy: a second element that changes it by less is none 
 
 
 def default_structure(loaded: LoadedCalculator, deadline: Deadline | None = None) -> Atoms:
-    """Return a test structure for a calculator: the calculator's own structure, a crystal, or rigid water.
+    """Return a test structure: the calculator's own, a crystal, or rigid water.
 
-    The crystal consists of an element for which the calculator is intended. If the calculator distinguishes
-    this element from a second one, half of the atoms are of the second element. The lattice constant
-    minimizes the calculator's energy of the crystal. The crystal is repeated until the cell is two cutoffs
-    wide (at most 500 atoms, fewer for a slow calculator), and its atoms are displaced slightly.
-    `info["origin"]` of the returned structure describes how the structure was built, and `info["guessed"]` is
-    True if the calculator names no element. If the calculator fails
-    on atoms without neighbors, a denser crystal is built; the failure is reported later.
+    The crystal consists of an element for which the calculator is intended. If the calculator distinguishes a
+    second element, half of the atoms are of that element. The lattice constant minimizes the calculator's
+    energy of the crystal. The cell is two cutoffs wide, with at most 500 atoms (fewer for a slow calculator).
+    The atoms are displaced slightly. `info["origin"]` describes how the structure was built.
+    `info["guessed"]` is True if the calculator names no element. If the calculator fails on atoms without
+    neighbors, a denser crystal is built.
 
     Args:
         deadline: time limit for building; at the deadline, or after `BUILDING_CALLS` calls, the best
@@ -86,7 +85,7 @@ def _labeled(atoms: Atoms, origin: str) -> Atoms:
 
 
 class _Builder:
-    """Builds a test structure for a calculator, and keeps the best structure that it has built so far."""
+    """Builds a test structure for a calculator. It keeps the best structure so far."""
 
     def __init__(self, loaded: LoadedCalculator, meter: Meter):
         self.name, self.calculator, self.meter = loaded.name, loaded.make(), meter
@@ -134,7 +133,7 @@ class _Builder:
         return self._mixed(made)
 
     def _first(self, symbols: Sequence[str], paired: bool = True) -> Atoms | None:
-        """Return a crystal of the first usable element; if `paired`, find the cutoff from a pair of atoms."""
+        """Return a crystal of the first usable element. If `paired`, a pair gives the cutoff."""
         for symbol in symbols:
             subject = self.about(Atoms(symbol, [(0, 0, 0)]))
             with subject.trying():
@@ -144,7 +143,7 @@ class _Builder:
         return None
 
     def _mixed(self, made: Atoms) -> Atoms:
-        """Return the crystal, with a second element added if the calculator distinguishes two elements."""
+        """Return the crystal, with a second element if the calculator distinguishes two."""
         from ase.data import atomic_numbers
 
         self.best, symbol = made, str(made.symbols[0])
@@ -169,7 +168,7 @@ class _Builder:
         return made
 
     def _crystal(self, subject: CalculatorSubject, pair: Pair | None, *symbols: str) -> Atoms | None:
-        """Build a crystal for the calculator; return None if the calculator fails at every density."""
+        """Build a crystal for the calculator. None if the calculator fails at every density."""
         if pair is not None:
             self.cutoff, self.least = _felt(subject, pair)
         elif len(symbols) == 1:
@@ -188,7 +187,7 @@ class _Builder:
 
 
 def meant_for(calculator: Any, words: str) -> list[str]:
-    """Return the elements named in a calculator's arguments, file or documentation, likeliest ones first."""
+    """Return the elements in a calculator's arguments, file or documentation, likeliest ones first."""
     from ase.data import atomic_names, atomic_numbers, chemical_symbols
 
     module = sys.modules.get(type(calculator).__module__)
@@ -210,7 +209,7 @@ def meant_for(calculator: Any, words: str) -> list[str]:
 
 
 def _symbols(value: Any, numbers: bool = False, depth: int = 4) -> Iterator[str]:
-    """Yield the chemical symbols in a value, its attributes, and dictionary keys (if all are symbols)."""
+    """Yield the chemical symbols in a value, its attributes, and its dictionary keys."""
     from ase.data import chemical_symbols
 
     value = value.tolist() if hasattr(value, "tolist") else value
@@ -232,7 +231,7 @@ def _symbols(value: Any, numbers: bool = False, depth: int = 4) -> Iterator[str]
 
 
 def water(edge: int = 4) -> Atoms:
-    """Return rigid water molecules on a cubic grid, in fixed random orientations, with atom order O, H, H."""
+    """Return rigid water molecules on a cubic grid in fixed random orientations. Order: O, H, H."""
     from ase.calculators.tip3p import angleHOH, rOH
     from scipy.spatial.transform import Rotation
 
@@ -246,10 +245,10 @@ def water(edge: int = 4) -> Atoms:
 
 
 def _processor_time(subject: CalculatorSubject, atoms: Atoms) -> float:
-    """Measure the processor time of one energy and force calculation twice; return the smaller value (s).
+    """Measure the processor time of one calculation twice. Return the smaller value (s).
 
-    The processor time includes that of the calculator's child processes. The time of other programs is not
-    included, so that the chosen structure does not depend on the load of the machine.
+    The processor time includes that of the calculator's child processes. Other programs are not included, so
+    the load of the machine does not affect the structure.
     """
 
     def clock() -> float:
@@ -267,9 +266,9 @@ def _processor_time(subject: CalculatorSubject, atoms: Atoms) -> float:
 
 
 def _felt(subject: CalculatorSubject, pair: Pair) -> tuple[float | None, float | None]:
-    """Estimate the cutoff and the distance of lowest energy of a pair interaction; each may be None.
+    """Estimate the cutoff and the distance of lowest energy of a pair. Each may be None.
 
-    If the calculator fails on atoms without neighbors, the cutoff is the distance at which it begins to fail.
+    If the calculator fails on atoms without neighbors, it begins to fail at the cutoff.
     """
     curve, distances = pair.curve(subject), _DISTANCES.tolist()
     known: dict[float, tuple[float, float]] = {}
@@ -302,7 +301,7 @@ def _felt(subject: CalculatorSubject, pair: Pair) -> tuple[float | None, float |
 
 
 def _feels(subject: CalculatorSubject, atoms: Atoms) -> bool:
-    """Return whether the atoms interact: some force is nonzero, or displacing atoms changes the energy."""
+    """Return whether the atoms interact: a force is nonzero, or displacements change the energy."""
     (energy, forces), moved = subject.both(atoms), atoms.copy()
     moved.rattle(_RATTLE * nearest_distance(atoms), seed=1)
     other = subject.try_both(moved)
@@ -313,7 +312,7 @@ def _feels(subject: CalculatorSubject, atoms: Atoms) -> bool:
 def _grown(
     subject: CalculatorSubject, cell: Atoms, kind: str, scale: float, relaxed: bool, cutoff: float | None
 ) -> Atoms | None:
-    """Return the largest crystal, up to two cutoffs wide, whose energy is computed fast enough, or None."""
+    """Return the largest crystal, up to two cutoffs wide, that is fast enough, or None."""
     at = "at the calculator's own least energy" if relaxed else _tabulated(scale)
     if cutoff and scale * _least_distance(cell) > _BARELY * cutoff:
         # nothing holds it together: a crystal in which nothing is felt would tell nothing
@@ -341,7 +340,7 @@ def _tabulated(scale: float) -> str:
 
 
 def _filled(cell: Atoms, kind: str, scale: float = 1.0, at: str | None = None, repeat: int = 2) -> Atoms:
-    """Scale the lattice of a unit cell, repeat the cell, displace the atoms slightly; return the crystal."""
+    """Scale and repeat a unit cell. Return the crystal with slightly displaced atoms."""
     cell = modified(cell, cell=cell.cell.array * scale, scaled=True)
     atoms, nearest = cell.repeat(repeat), _least_distance(cell)
     atoms.rattle(_RATTLE * nearest, seed=0)
@@ -353,9 +352,9 @@ def _filled(cell: Atoms, kind: str, scale: float = 1.0, at: str | None = None, r
 
 
 def _unit_cell(symbol: str, *others: str) -> tuple[Atoms, str]:
-    """Return a rectangular fcc, bcc or diamond unit cell; an element with another structure is built as fcc.
+    """Return a rectangular fcc, bcc or diamond unit cell. Elements with other structures become fcc.
 
-    If a second element is given, half of the atoms are of this element.
+    Half of the atoms are of the second element, if given.
     """
     from ase.build import bulk
     from ase.data import atomic_numbers, covalent_radii, reference_states
@@ -379,7 +378,7 @@ def _least_distance(cell: Atoms) -> float:
 def _least_energy(
     subject: CalculatorSubject, cell: Atoms, least: float | None, start: float
 ) -> tuple[float, bool]:
-    """Return the lattice scaling factor of lowest energy, and whether the energy has a minimum there."""
+    """Return the scaling factor of lowest energy, and whether the energy has a minimum there."""
 
     def energy(scale: float) -> float:
         try:

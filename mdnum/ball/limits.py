@@ -1,4 +1,4 @@
-"""Ranges of floating-point formats, and the smallest usable tolerance of a bouncing ball's contact solver."""
+"""Ranges of floating-point formats, and the smallest usable tolerance of a contact solver."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ def largest(name: str) -> float:
 
 
 def spacing(value: float, name: str) -> float:
-    """Return the distance from a number to the next number of a floating-point format."""
+    """Return the distance from a number to the next number of a format."""
     limits = ml_dtypes.finfo(DTYPES[name])
     exponent = int(np.floor(np.log2(max(abs(value), float(limits.smallest_normal)))))
     return float(limits.eps) * 2.0**exponent
@@ -37,11 +37,11 @@ def rounded(value: float, name: str) -> float:
 
 
 def smallest_tolerance(precision: Any, gain: float = 1.0, kind: str = "term") -> dict[str, float]:
-    """Return the smallest tolerance (m) that a solver can reach in each floating-point format that it uses.
+    """Return the smallest tolerance (m) that a solver can reach in each of its formats.
 
-    Iterations no longer reduce a penetration once `gain` times the penetration rounds to zero. A tolerance
-    below the smallest number of a format rounds to zero. A usable tolerance is at least the largest of the
-    returned tolerances.
+    A penetration no longer decreases if `gain` times the penetration rounds to zero. A tolerance below the
+    smallest number of a format rounds to zero. A usable tolerance is at least the largest of the returned
+    tolerances.
 
     Args:
         precision: names of formats by role, as attributes.

@@ -1,7 +1,7 @@
-"""Command line of mdnum: arguments, commands and printing. It does not import jax.
+"""Command line of mdnum: arguments, commands and printing.
 
-The exit code is 0 without findings, 1 with findings and 2 for invalid input. It is 3 if the time limit ended
-the command.
+This package does not import jax. The exit code is 0 without findings, 1 with findings and 2 for invalid
+input. It is 3 if the time limit ended the command.
 """
 
 from __future__ import annotations

@@ -1,12 +1,11 @@
 """Separate processes that run one system in several differently compiled programs.
 
-Programs of one system (compiled, uncompiled, batched, differentiated, or for other processors) compute the
-same formulas, but may round differently. XLA flags apply to a whole process, so each variant of a program
-runs in its own process. Variants whose positions have equal hashes at every step are numerically the same
-program. If hashes differ, the groups of variants with equal hashes indicate the cause.
+Programs of one system may be compiled, batched or differentiated. They compute the same formulas but may
+round differently. Each variant of a program runs in its own process, because XLA flags apply to a whole
+process. Variants with equal hashes of positions at every step are numerically the same program. If hashes
+differ, the groups of variants with equal hashes indicate the cause.
 
-`python -m mdnum.forks.processes FILE` executes the task described in a JSON file, and writes a file with an
-array of positions.
+`python -m mdnum.forks.processes FILE` executes the task in a JSON file and writes an array of positions.
 """
 
 from __future__ import annotations
@@ -97,7 +96,7 @@ class Ran:
 
     @property
     def separation(self) -> float:
-        """Largest displacement of an atom relative to the reference run at the last step; NaN on failure."""
+        """Largest displacement of an atom from the reference run at the last step. NaN on failure."""
         return float(self.separations[-1]) if len(self.separations) else float("nan")
 
     def agrees(self, other: Ran) -> bool:
@@ -118,7 +117,7 @@ class Variants:
 
     @property
     def clusters(self) -> list[list[str]]:
-        """Names of variants, in groups with bit-identical results; the group of the reference comes first."""
+        """Names of variants, in groups with bit-identical results. The reference's group comes first."""
         count = max(row.cluster for row in self.rows) + 1
         return [[row.variant.name for row in self.rows if row.cluster == k] for k in range(count)]
 
@@ -129,9 +128,9 @@ def variants(
     which: Sequence[Variant] = VARIANTS,
     progress: Callable[[int, int, str], None] | None = None,
 ) -> Variants:
-    """Run a system in several variants of its program, two processes at a time, and find which results agree.
+    """Run a system in several variants of its program. Find which results agree.
 
-    All variants use one neighbor list; its skin is doubled if the box is large enough. Variants stop before
+    All variants use one neighbor list. Its skin is doubled if the box is large enough. Variants stop before
     an atom moves half the skin. Groups may differ between machines: some processors lack fused multiply-add.
 
     Args:
@@ -211,7 +210,7 @@ def _ran(variant: Variant, question: Mapping[str, Any], file: Path) -> tuple[Ran
 
 
 def clustered(rows: Sequence[Ran]) -> list[Ran]:
-    """Assign each variant to a cluster of equal results; cluster 0 contains the first successful variant."""
+    """Assign each variant to a cluster of equal results. Cluster 0 has the first successful variant."""
     reference = next((row for row in rows if not row.failed), None)
     # the longest of each cluster stands for it, so that a short run joins whom it agrees with
     heads: list[Ran] = []
@@ -225,11 +224,11 @@ def clustered(rows: Sequence[Ran]) -> list[Ran]:
 
 
 def causes_of(rows: Sequence[Ran]) -> Iterator[dict[str, Any]]:
-    """Return codes for the causes of differences between variants; variants without a result are ignored.
+    """Return codes for the causes of differences between variants. Failed variants are ignored.
 
     The codes "fused", "others" and "not_fused" concern fused operations. The codes "eager_..." concern the
-    program without a compiler, and "reversed" concerns reversed sums. Other codes concern the program named
-    by "program". If a variant differs from the reference, "step" is the first step at which they differ.
+    uncompiled program. "reversed" concerns reversed sums. Other codes concern the program named by "program".
+    "step" is the first step at which a variant differs from the reference.
     """
     by_name = {row.variant.name: row for row in rows if not row.failed}
     reference = next(iter(by_name.values()))
@@ -270,9 +269,9 @@ def causes_of(rows: Sequence[Ran]) -> Iterator[dict[str, Any]]:
 def positions_of(
     simulation: Simulation, steps: int, program: ProgramName
 ) -> Float[np.ndarray, "steps 3 atoms"]:
-    """Compute wrapped positions at steps 1, 2, ... with one program, in the user's order of atoms.
+    """Compute wrapped positions at steps 1, 2, ... with one program. Atoms are in the user's order.
 
-    The computation ends before an atom has moved by half of the skin, as only one neighbor list is built.
+    The run ends before an atom moves by half the skin, because only one neighbor list is built.
     """
     from mdnum.md.cell import displacement
     from mdnum.rollout.engine import Engine, first_state
@@ -346,7 +345,7 @@ def _stepped(simulation: Any, steps: int, program: ProgramName) -> np.ndarray:
 
 
 def in_a_file(system: Simulation | BallSystem) -> System | BallSystem:
-    """Return a system in a form from which another process can recreate it, bit for bit.
+    """Return a system in a form that another process can restore, bit for bit.
 
     Raises:
         InputError: the system was made from objects, which exist only in this process.
@@ -365,13 +364,13 @@ def in_a_file(system: Simulation | BallSystem) -> System | BallSystem:
 
 
 def _question(system: Simulation | BallSystem, steps: int, folder: Path) -> dict[str, Any]:
-    """Assemble the input of a process: the system, saved in a folder, and the last step."""
+    """Return the input of a process: the saved system and the last step."""
     path = in_a_file(system).write(folder / "system")
     return {"path": str(path), "steps": steps, "code": is_allowed()}
 
 
 def _ask(question: Mapping[str, Any], file: Path, settings: Mapping[str, str]) -> str:
-    """Run a process that executes a task; return the reason for its failure, or "" if it succeeded.
+    """Run a process that executes a task. Return why it failed, or "" if it succeeded.
 
     `settings` are environment variables of the new process.
     """

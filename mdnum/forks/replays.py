@@ -1,7 +1,7 @@
-"""Repeat molecular-dynamics runs around a fork: find nearby atoms, override decisions, find minimal causes.
+"""Repeated runs around a fork: nearby atoms, imposed decisions and minimal causes.
 
-To override a decision of run B, the decision of run A is imposed on B; B makes all other decisions itself.
-The tool Verrou uses delta debugging to find the instructions that cause an error.
+Decisions of run A can be imposed on run B. B makes all other decisions itself. The tool Verrou searches for
+the instructions that cause an error in a similar way.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ _SAMPLES = 400
 
 @dataclass(frozen=True)
 class Neighborhood:
-    """The atoms near the pair for which the two runs first decide differently, at the step of the fork."""
+    """The atoms near the pair whose decision differs first, at the step of the fork."""
 
     # labels of A; the pair first, the others by their distance from its middle, shape (near,)
     atoms: Int[np.ndarray, "near"]
@@ -48,7 +48,7 @@ class Neighborhood:
 
 
 def neighborhood(fork: Fork) -> Neighborhood | None:
-    """Repeat both runs; return atoms near the pair at the fork, or None if the fork has no pair of atoms."""
+    """Repeat both runs. Return the atoms near the pair at the fork, or None without a pair."""
     if fork.decision is None:
         return None
     program_a, program_b = fork.twin.a, fork.twin.b
@@ -88,7 +88,7 @@ def neighborhood(fork: Fork) -> Neighborhood | None:
 
 @dataclass(frozen=True)
 class Pinned:
-    """Result of repeating run B with decisions of run A imposed on some pairs of atoms."""
+    """Result of run B with decisions of run A on some pairs of atoms."""
 
     pairs: tuple[tuple[int, int], ...]  # whose decisions were
     # first, last: steps of the window in which they were
@@ -107,7 +107,7 @@ def pinned(
     last: int | None = None,
     steps: int | None = None,
 ) -> Pinned:
-    """Repeat run B with run A's decisions on some pairs of atoms, and compute the distance between the runs.
+    """Repeat run B with run A's decisions on some pairs. Compute the distance between the runs.
 
     Args:
         fork: a pair of runs with the same atom labels.
@@ -176,7 +176,7 @@ def parse_pin(text: str, atoms: int) -> dict[str, Any]:
 
 
 def check_pins(fork: Fork) -> None:
-    """Raise an error if decisions on pairs of atoms cannot be imposed from one run on the other run.
+    """Raise an error if decisions of one run cannot be imposed on the other.
 
     Raises:
         InputError: a potential is many-body, or the runs have different atom labels or axes.
@@ -195,7 +195,7 @@ def check_pins(fork: Fork) -> None:
 
 
 def disagreements(fork: Fork, i: int, j: int) -> list[tuple[int, int | None]]:
-    """Return step intervals (first, end or None) in which two runs decide differently on a pair of atoms.
+    """Return step intervals (first, end or None) in which the decisions on a pair differ.
 
     Only the stored differences between the decisions of the two runs are used.
     """
@@ -215,7 +215,7 @@ def disagreements(fork: Fork, i: int, j: int) -> list[tuple[int, int | None]]:
 
 @dataclass(frozen=True)
 class Minimal:
-    """A minimal set of atom pairs: imposing run A's decisions on these pairs keeps run B close to run A."""
+    """A minimal set of pairs. Imposing run A's decisions on them keeps run B close to run A."""
 
     # pairs (i, j) whose pinning to A's decisions, from the start to the horizon, keeps B with A; None where
     # no set does
@@ -229,14 +229,14 @@ class Minimal:
 
     @property
     def proven(self) -> bool:
-        """True if each pair of atoms in the set was shown to be necessary."""
+        """True if each pair of the set was shown to be necessary."""
         return self.code in ("alone", "proven")
 
 
 def minimal_cause(
     fork: Fork, *, tests: int = 80, progress: Callable[[int, int], None] | None = None
 ) -> Minimal:
-    """Find a minimal set of atom pairs on which imposing run A's decisions keeps run B close to run A.
+    """Find a minimal set of pairs on which run A's decisions keep run B close to run A.
 
     Args:
         fork: a pair of runs with the same atom labels that has forked and split.
@@ -270,7 +270,7 @@ def minimal_cause(
 
 
 class _Search:
-    """Search that repeats run B with A's decisions on some atom pairs, to test whether B stays close to A."""
+    """Search that repeats run B with A's decisions and tests whether B stays close to A."""
 
     def __init__(
         self,
@@ -299,7 +299,7 @@ class _Search:
                 self._positions[segment.first + row] = HostCell(segment.cell_of(row)), x
 
     def holds(self, keys: Sequence[int]) -> bool:
-        """Repeat B with A's decisions on atom pairs; test if B stays near A (False if no run is left)."""
+        """Repeat B with A's decisions on pairs. True if B stays near A, False if no run is left."""
         name = frozenset(keys)
         if name not in self.known:
             if self.spent():
@@ -328,10 +328,10 @@ class _Search:
 
 
 def _required(keys: list[int], search: _Search, until: int) -> list[int]:
-    """Find a sufficient set of atom pairs by bisection, one necessary pair after another (QuickXplain).
+    """Find a sufficient set of pairs by bisection, one necessary pair after another (QuickXplain).
 
-    For n atom pairs, QuickXplain needs about log2(n) runs per necessary pair; delta debugging needs about n²
-    runs. The search assumes that imposing more decisions never splits runs. It stops after `until` runs.
+    QuickXplain needs about log2(n) runs per necessary pair of n. Delta debugging needs about n² runs. The
+    search assumes that imposing more decisions never splits runs. It stops after `until` runs.
 
     Source: U. Junker, QuickXplain, AAAI 2004.
     """

@@ -1,4 +1,4 @@
-"""Cutoff decisions on all pairs of atoms in a run, to be compared with or imposed on another run."""
+"""Cutoff decisions on all pairs in a run, to compare or impose them."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from mdnum.rollout.program import MdProgram
 
 @dataclass(frozen=True)
 class DecisionTape:
-    """All pair decisions of a run: the pairs of atoms inside the cutoff at step 0, and all later changes."""
+    """All pair decisions of a run: the pairs inside at step 0, and all later changes."""
 
     atoms: int  # number of atoms
     steps: int  # the last step that was decided
@@ -35,14 +35,14 @@ class DecisionTape:
 
     @cached_property
     def changes(self) -> dict[int, tuple[int, ...]]:
-        """Map from the integer key of each pair of atoms to the steps (ascending) at which the pair flips."""
+        """Map from the key of each pair to the ascending steps at which it flips."""
         order = np.argsort(self.key, kind="stable")
         keys, begins = np.unique(self.key[order], return_index=True)
         steps = np.split(self.step[order], begins[1:])
         return {key: tuple(own.tolist()) for key, own in zip(keys.tolist(), steps, strict=True)}
 
     def pins(self, keys: Iterable[int], first: int, last: int) -> Pins:
-        """Return the decisions on pairs of atoms between two steps, to be imposed on another run."""
+        """Return the decisions on pairs between two steps, to impose them on another run."""
         begins = set(self.first.tolist())
         return Pins(
             [
@@ -52,20 +52,20 @@ class DecisionTape:
         )
 
     def inside(self, step: int) -> Int[np.ndarray, "pairs"]:
-        """Return the sorted integer keys of the pairs that are inside the cutoff at a given step."""
+        """Return the sorted keys of the pairs inside the cutoff at a step."""
         members = set(self.first.tolist())
         for _, key, entered in self.rows(step):
             (members.add if entered else members.discard)(key)
         return np.array(sorted(members), np.int64)
 
     def rows(self, last: int) -> list[tuple[int, int, bool]]:
-        """Return the step, the pair key and the direction of every flip up to a given last step."""
+        """Return step, pair key and direction of every flip up to a given step."""
         columns = (column[self.step <= last].tolist() for column in (self.step, self.key, self.entered))
         return list(zip(*columns, strict=True))
 
 
 def first_difference(a: DecisionTape, b: DecisionTape) -> Decision | None:
-    """Find the first step at which the decisions of two runs differ; None if all decisions agree.
+    """Find the first step at which the decisions of two runs differ. None if all agree.
 
     Raises:
         ValueError: the tapes have different numbers of atoms.
@@ -89,7 +89,7 @@ def first_difference(a: DecisionTape, b: DecisionTape) -> Decision | None:
 
 
 def taped(program: MdProgram, last: int, watch: Callable[[Segment], None]) -> DecisionTape:
-    """Record every decision of a run up to a last step; `watch` is called with each segment of the run."""
+    """Record every decision of a run up to a last step. `watch` is called with each segment."""
     simulation = program.simulation
     recorder, first, ledgers, end = PairRecorder(simulation), np.empty(0, np.int64), [], 0
     for segment in Engine(simulation, last, start=program.begin).segments():

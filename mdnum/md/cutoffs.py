@@ -1,13 +1,13 @@
-"""Cutoffs: formulas that truncate, shift or switch a pair potential u(r) at the cutoff radius r_cut.
+"""Cutoffs: formulas that truncate, shift or switch a pair potential u(r) at r_cut.
 
-Every cutoff maps the value u and slope w = du/d(r²) of the bare potential to the value and slope of the cut
-potential, for pairs inside the cutoff. The module `decide` determines which pairs are inside the cutoff.
+A cutoff maps the value u and slope w = du/d(r²) of the bare potential to those of the cut potential, for
+pairs inside the cutoff. The module `decide` determines which pairs are inside the cutoff.
 
-A cutoff is a class with a formula `cut`, a name and a smoothness. All other parts of the package find a
-cutoff by its name in `CUTOFFS`. A class may also define the independent implementation `reference` and the
-interval-arithmetic version `enclose`. By default, `reference` and `enclose` are derived from `cut`.
+A cutoff is a class with a formula `cut`, a name and a smoothness. The rest of the package finds it by its
+name in `CUTOFFS`. A class may also define the independent implementation `reference` and the interval
+arithmetic `enclose`. By default, `reference` and `enclose` are derived from `cut`.
 
-All formulas work with numpy and jax arrays; this module does not import jax.
+All formulas work with numpy and jax arrays. This module does not import jax.
 """
 
 from __future__ import annotations
@@ -59,15 +59,15 @@ class Cutoff(ABC):
         """
 
     def energy_jump(self, at: AtCutoff):
-        """Return the energy jump when a pair enters the cutoff: the limit of the pair energy at r_cut."""
+        """Return the energy jump of a pair that enters: the limit of its energy at r_cut."""
         return self._limits(at)[0] if self.smoothness < 0 else 0 * at.energy
 
     def force_jump(self, at: AtCutoff):
-        """Return the radial force jump (energy/length) as a pair enters the cutoff; positive if repulsive."""
+        """Return the radial force jump (energy/length) of a pair that enters. Positive if repulsive."""
         return -2 * at.r_cut * self._limits(at)[1] if self.smoothness < 1 else 0 * at.slope
 
     def jumps(self, at: AtCutoff):
-        """Return (energy jump, force jump) of each term of the potential; a single potential is one term."""
+        """Return (energy jump, force jump) of each term of the potential."""
         return [(self.energy_jump(at), self.force_jump(at))]
 
     def _limits(self, at: AtCutoff):
@@ -75,13 +75,13 @@ class Cutoff(ABC):
 
     @property
     def continuous(self) -> Cutoff:
-        """A cutoff with the same forces, whose energy is shifted to be continuous at r_cut."""
+        """A cutoff with the same forces and an energy that is continuous at r_cut."""
         return self if self.smoothness >= 0 else Level(self)
 
     def reference(
         self, r: Float[np.ndarray, "pairs"], u: Float[np.ndarray, "pairs"], du: Any, at: AtCutoff
     ) -> tuple[Float[np.ndarray, "pairs"], Float[np.ndarray, "pairs"]]:
-        """Return energy and derivative with respect to r in float64 on the host, as a reference for `cut`.
+        """Return energy and derivative by r in float64 on the host, as a reference for `cut`.
 
         The default method differentiates the energy of `cut` with jax. The slope returned by `cut` is not
         used.
@@ -104,9 +104,9 @@ class Cutoff(ABC):
     def enclose(
         self, pull: Callable[[Any], Any], energy: Callable[[Any], Any], at: AtCutoff
     ) -> Callable[[Any], Any]:
-        """Return a function that computes 2 du/d(r²) of the cut potential from r², in ball arithmetic.
+        """Return a function that computes 2 du/d(r²) of the cut potential in ball arithmetic.
 
-        The default method executes the operations of `cut` one by one in ball arithmetic.
+        The default executes the operations of `cut` in ball arithmetic.
 
         Args:
             pull, energy: 2 du/d(r²) and u of the bare potential, as functions of the ball r².
@@ -136,14 +136,13 @@ _ORDERS = len(_DERIVATIVES) - 1
 
 
 def check(cutoff: type[Cutoff] | Cutoff) -> None:
-    """Check that a cutoff's slope is the derivative of its energy, and that its smoothness is as declared.
+    """Check a cutoff's slope against its energy, and its smoothness against its declaration.
 
-    The test potentials are u = 1/r² and u = 1/r⁶ with r_cut = 2 and onset 1.6. The energy and its derivatives
-    with respect to r² (nested jvp) are evaluated within 2⁻⁴⁶ of the onset and of r_cut. The highest
-    derivative, one order above the declared smoothness, must jump for at least one test potential. An energy
-    difference above 1e-9 u(r_cut) counts as a jump. A difference of derivative k counts as a jump if it
-    exceeds 1e-5 u(r_cut) k! / (r_cut² - r_onset²)^k. Jumps at other distances and jumps of derivatives beyond
-    the sixth are not detected.
+    The test potentials are u = 1/r² and u = 1/r⁶ with r_cut = 2 and onset 1.6. Energy and derivatives by r²
+    (nested jvp) are evaluated within 2⁻⁴⁶ of the onset and of r_cut. The derivative one order above the
+    declared smoothness must jump for at least one potential. An energy difference above 1e-9 u(r_cut) counts
+    as a jump. A difference of derivative k is a jump if it exceeds 1e-5 u(r_cut) k! / (r_cut² - r_onset²)^k.
+    Jumps elsewhere and derivatives beyond the sixth are not tested.
 
     Raises:
         ValueError: the test fails; the message contains the quantity and the distance.
@@ -161,7 +160,7 @@ def check(cutoff: type[Cutoff] | Cutoff) -> None:
 
 
 def _ends(made: Cutoff, power: int) -> bool:
-    """Check a cutoff of u = r^(-2 power); return True if the derivative of order smoothness + 1 jumps."""
+    """Check a cutoff of u = r^(-2 power). Return True if derivative smoothness + 1 jumps."""
     import jax
     import jax.numpy as jnp
 
@@ -283,7 +282,7 @@ class _Switching(Cutoff):
     switches = True
 
     def factor(self, r, at: AtCutoff):
-        """Return the switching factor s(r) and ds/dr beyond the onset, implemented independently in numpy."""
+        """Return the switching factor s(r) and ds/dr beyond the onset, in numpy."""
         raise NotImplementedError
 
     def factor_of_ball(self, r2, at: AtCutoff):
@@ -346,10 +345,10 @@ class _SwitchedInDistance(_Switching):
 
     @abstractmethod
     def switch(self, t) -> tuple[Float[Any, "..."], Float[Any, "..."]]:
-        """Return the switching function and its derivative for t in [0, 1], from onset to cutoff."""
+        """Return the switching function and its derivative by t in [0, 1]."""
 
     def switch_of_ball(self, t):
-        """Return the switching function and its derivative with respect to t, in ball arithmetic."""
+        """Return the switching function and its derivative by t, in ball arithmetic."""
         return self.switch(t)
 
     def cut(self, r2, u, w, at):

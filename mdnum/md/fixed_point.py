@@ -1,13 +1,12 @@
-"""Simulations with fixed-point numbers: positions, momenta and pair forces are multiples of fixed units.
+"""Simulations with fixed-point numbers: positions, momenta and pair forces are integers times a unit.
 
-All units are powers of two, so that integer multiples of a unit are stored exactly as doubles, in the same
-arrays as floating-point positions. Sums of integers do not depend on the order of summation. Squared
-distances in pair decisions have no rounding error. A step that adds an integer is reversed by subtracting
-this integer.
+All units are powers of two. Integer multiples of a unit are therefore exact doubles. Sums of integers do not
+depend on the order of summation. Squared distances in pair decisions have no rounding error. A step that adds
+an integer is reversed by subtracting this integer.
 
-A pair force is computed in float64 from the exact integer distance, by operations that round equally with
-every compiler. The force is then rounded to its unit. The forces on both atoms are exactly opposite, so that
-the total momentum is exactly constant. Forces do not depend on atom labels or on the neighbor list.
+A pair force is computed in float64 from the exact distance. Its operations round equally with every compiler.
+The force is then rounded to its unit. The forces on both atoms are exactly opposite. The total momentum is
+therefore constant. Forces do not depend on atom labels or on the neighbor list.
 """
 
 from __future__ import annotations
@@ -53,7 +52,7 @@ _FEWEST = 1024
 
 
 def power_of_two(x: float) -> float:
-    """Return the smallest power of two that is greater than or equal to x."""
+    """Return the smallest power of two that is at least x."""
     mantissa, exponent = math.frexp(x)
     return math.ldexp(1.0, exponent - 1 if mantissa == 0.5 else exponent)
 
@@ -78,11 +77,11 @@ class FixedPointUnits:
         kT: float,
         timestep: float,
     ) -> FixedPointUnits:
-        """Choose the fixed-point units for a box, a neighbor list radius and a potential.
+        """Choose the units for a box, a neighbor list radius and a potential.
 
-        The position spacing is the smallest power of two for which squared distances of listed pairs are
-        exact. The unit of force is the smallest unit for which momenta and forces stay in the range of exact
-        sums in every valid run. The unit of momentum is the unit of force times half a time step.
+        The position spacing is the smallest power of two with exact squared distances of listed pairs. The
+        unit of force is the smallest with exact sums of momenta and forces in every valid run. The unit of
+        momentum is the unit of force times half a time step.
 
         Args:
             r_list: radius of the neighbor lists, length.
@@ -135,7 +134,7 @@ class FixedPointUnits:
         return np.round(np.asarray(x, np.float64) / self.spacing) * self.spacing
 
     def total(self, terms: Float[Any, "*shape"]) -> Float[Any, ""]:
-        """Round each energy to the unit of energy, and return the sum, independent of order (inside jit)."""
+        """Return the sum of energies, each rounded to the unit of energy. The order has no effect."""
         return jnp.sum(jnp.round(terms * (1 / self.energy))) * self.energy
 
     def to_dict(self, timestep: float) -> dict[str, float]:
@@ -150,7 +149,7 @@ class FixedPointUnits:
 
 
 def _depth(model: CutPotential) -> float:
-    """Return an energy scale of a pair potential: its depth or, if repulsive, its value near 0.6 r_cut."""
+    """Return an energy scale of a pair potential: its depth, or its value near 0.6 r_cut."""
     r_cut = np.asarray(model.r_cut, np.float64)
     r = r_cut * np.linspace(0.2, 1.0, 400)[:, None]
     energy = np.asarray(model.potential.evaluate(jnp.asarray(r * r))[0])
@@ -165,9 +164,9 @@ def _depth(model: CutPotential) -> float:
 class FixedPointDecider(PairDecider):
     """Decision whether a pair is inside the cutoff, by comparison of two integers.
 
-    The squared distance is an integer in units of the squared position spacing. Every comparison is converted
-    to the form `r2 < limit` with an integer limit. Margins are measured from a threshold that is half a unit
-    below the integer limit. Margins are therefore never zero and have no rounding error.
+    The squared distance is an integer in units of the squared position spacing. A comparison has the form
+    `r2 < limit` with an integer limit. The threshold for margins is half a unit below the limit. Margins are
+    therefore never zero and have no rounding error.
     """
 
     spacing: float = 1.0  # of positions, length
@@ -179,7 +178,7 @@ class FixedPointDecider(PairDecider):
 
     @property
     def limits(self) -> tuple[int, ...]:
-        """Smallest r² outside the cutoff, in units of the squared position spacing, by pair type."""
+        """Smallest r² outside the cutoff by pair type, in units of the squared position spacing."""
         unit = Fraction(self.spacing) ** 2
         square = self.compare.startswith("r2")
         exact = [(Fraction(r * r) if square else Fraction(r) ** 2) / unit for r in self.r_cut]
@@ -187,7 +186,7 @@ class FixedPointDecider(PairDecider):
 
     @property
     def thresholds(self) -> tuple[Threshold, ...]:
-        """Thresholds of r² by pair type, as doubles: half a squared position spacing below `limits`."""
+        """Thresholds of r² by pair type, as doubles. They are half a unit below `limits`."""
         unit = self.spacing * self.spacing
         return tuple(Threshold((limit - 0.5) * unit, "<", "r2") for limit in self.limits)
 
@@ -207,11 +206,11 @@ class FixedPointDecider(PairDecider):
         return whole[0] * whole[0] + whole[1] * whole[1] + whole[2] * whole[2]
 
     def host_quantity(self, dx, dy, dz) -> Float[np.ndarray, "..."]:
-        """Return squared distances on the host, in units of length², exact except for one rounding."""
+        """Return squared distances on the host (length²). They are rounded only once."""
         return self.host_squares(dx, dy, dz).astype(np.float64) * (self.spacing * self.spacing)
 
     def host_margin(self, displacement, kind) -> Float[np.ndarray, "..."]:
-        """Return margins of squared distances on the host, computed exactly and then rounded to doubles."""
+        """Return margins of squared distances on the host. They are exact except for one rounding."""
         left = np.asarray(self.limits, np.int64)[kind] - self.host_squares(*displacement)
         return (left - 0.5) * (self.spacing * self.spacing)
 
@@ -240,11 +239,11 @@ class FixedPointStep(Integrator):
         return jnp.round(v * (masses / self.impulse))
 
     def velocity(self, p: Float[Array, "3 atoms"], masses: Float[Array, "atoms"]) -> Float[Array, "3 atoms"]:
-        """Return velocities from integer momenta; NaN if a momentum is too large for an exact conversion."""
+        """Return velocities from integer momenta. NaN if a momentum is too large."""
         return jnp.where(jnp.abs(p) < _LARGEST, p * (self.impulse / masses), jnp.nan)
 
     def kick(self, v, time, acceleration, masses):
-        """Return velocities after an acceleration for a given time, with momenta rounded to integers."""
+        """Return velocities after an acceleration for a given time. Momenta are rounded to integers."""
         push = jnp.round(time * acceleration * (masses / self.impulse))
         return self.velocity(self.momentum(v, masses) + push, masses)
 
@@ -261,14 +260,14 @@ class FixedPointStep(Integrator):
 
     @abstractmethod
     def undrift(self, x, v, extra, masses, step, order):
-        """Reverse the drift of a step: return positions, velocities and extra state before the drift."""
+        """Return positions, velocities and extra state before the drift of a step."""
 
     def kinetic(self, v, masses):
-        """Return the kinetic energy, which does not depend on the order of the atoms."""
+        """Return the kinetic energy. The order of the atoms has no effect."""
         return self.units.total(0.5 * (masses * squared_norm(v[0], v[1], v[2], self.zero)))
 
     def glide(self, x, p, masses, share: float, direction: int):
-        """Move atoms for a `share` of a time step at constant momenta; backward if direction is -1."""
+        """Move atoms for a `share` of a time step. Move them backward if direction is -1."""
         moved = jnp.round(p * (share * self.stride / masses))
         return x + direction * self.units.spacing * moved
 
@@ -299,7 +298,7 @@ class FixedPointLangevin(FixedPointStep):
     pause: Int[Array, ""] = eqx.field(kw_only=True)  # steps after which the bath is put aside
 
     def noise(self, step, masses, order) -> Float[Array, "3 atoms"]:
-        """Return the momentum added by noise, in integer units, as a function of the step number."""
+        """Return the momentum added by noise at a step, in integer units."""
         low = np.nextafter(-1.0, 0.0)
         shape = (3, masses.shape[0])
         # the numbers that jax.random.normal makes its deviates of
@@ -378,7 +377,7 @@ def fixed_point_steps(integrator: Integrator, units: FixedPointUnits) -> FixedPo
 
 
 def _period(kept: int) -> int:
-    """Return after how many steps an integer may overflow if each step multiplies it by 2^24 / `kept`."""
+    """Return after how many steps a factor of 2^24 / `kept` per step may overflow an integer."""
     if not 0 < kept < 2**_SHIFT:
         return 0
     growth = 2**_SHIFT / kept
@@ -387,7 +386,7 @@ def _period(kept: int) -> int:
 
 
 def forgotten_bits(integrator: Integrator) -> float:
-    """Return how many bits of a momentum component friction removes per step; 0 without a thermostat."""
+    """Return the bits of a momentum that friction removes per step. 0 without a thermostat."""
     if isinstance(integrator, Langevin):
         return float(integrator.friction) * float(integrator.timestep) / math.log(2)
     return 0.0
@@ -402,7 +401,7 @@ _ROUND_BITS = int(np.float64(_ROUND).view(np.int64))
 
 @jax.custom_jvp
 def counted(x: Float[Array, "*shape"], zero: jax.Array) -> jax.Array:
-    """Round numbers below 2^51 to integers by a single addition; return the integers plus `_ROUND_BITS`."""
+    """Round numbers below 2^51 to integers by one addition. The result includes `_ROUND_BITS`."""
     return lax.bitcast_convert_type(fence(x, zero) + _ROUND, jnp.int64)
 
 
@@ -417,7 +416,7 @@ def _counted_jvp(primals, tangents):
 
 
 class FixedPointJudge(SlotJudge):
-    """Pair decisions by comparison of integers in fixed-point units, with the interface of `SlotJudge`."""
+    """Pair decisions from integers in fixed-point units. The interface is that of `SlotJudge`."""
 
     def __init__(
         self, decider: FixedPointDecider, limits, cell: Cell, zero, positions, units: FixedPointUnits
@@ -435,7 +434,7 @@ class FixedPointJudge(SlotJudge):
         return jnp.full(self.atoms, jnp.iinfo(jnp.int64).max, jnp.int64)
 
     def group(self, j, types):
-        """Return displacements, r², decisions and limits of neighbors j, in units of the position spacing."""
+        """Return displacements, r², decisions and limits of neighbors j, in position spacings."""
         d = displacements(self.components, self.cell, j)
         edge = float(2**REACH_BITS)
         # what is further away than any listed pair is outside; its square might not fit
@@ -450,7 +449,7 @@ class FixedPointJudge(SlotJudge):
         return d, r2, r2 < limit, limit
 
     def tally(self, nearest, quantity, inside, threshold):
-        """Return the cutoff decisions on a group of neighbors as bits, and each atom's smallest |margin|."""
+        """Return the decisions on a group of neighbors as bits, and each atom's smallest |margin|."""
         bits = jnp.zeros(self.atoms, jnp.uint8)
         left = threshold - quantity
         away = jnp.maximum(left, 1 - left)
@@ -460,7 +459,7 @@ class FixedPointJudge(SlotJudge):
         return bits, nearest
 
     def finish(self, nearest, halves) -> Decisions:
-        """Return the decisions for the whole neighbor list, with two groups of slots per byte."""
+        """Return the decisions for the whole list, with two groups of slots per byte."""
         unit = self.units.spacing * self.units.spacing
         closest = jnp.min(nearest, initial=jnp.iinfo(jnp.int64).max)
         margin = jnp.where(closest < _NOWHERE, (closest.astype(jnp.float64) - 0.5) * unit, jnp.inf)
@@ -478,7 +477,7 @@ class FixedPointForce(PairForce):
     def on(
         cls, units: FixedPointUnits, model: CutPotential, cell: Cell, decider, policy, reduction
     ) -> FixedPointForce:
-        """Create the force object in float64; `reduction` has no effect, since sums are exact."""
+        """Create the force object in float64. `reduction` has no effect, since sums are exact."""
         return cls(
             model.astype(np.float64),
             cell.astype(np.float64),
@@ -493,7 +492,7 @@ class FixedPointForce(PairForce):
 
     @property
     def law(self) -> Guarded:
-        """The potential with its cutoff, in arithmetic that gives the same bits with every compiler."""
+        """The potential with its cutoff. Every compiler gives the same bits."""
         return Guarded(self.model, self.zero, reproducible)
 
     def judge(self, positions: Float[Array, "3 atoms"]) -> FixedPointJudge:
@@ -502,13 +501,13 @@ class FixedPointForce(PairForce):
         return FixedPointJudge(self.decider, self.thresholds, self.cell, self.zero, positions, self.units)
 
     def decide(self, positions, tables):
-        """Return the decisions on all pairs of a neighbor list, made from integer distances."""
+        """Return the decisions on all pairs of a neighbor list, from integer distances."""
         return self.judge(positions).decide(tables)
 
     def __call__(self, positions, tables, *, decisions, tensor=False, given=None, where=None):
         """Return forces, rounded per pair to integer multiples of the unit of force.
 
-        If the force of a close pair exceeds the range of exact sums, the energy is NaN.
+        The energy is NaN if a pair force exceeds the range of exact sums.
         """
         judge, units = self.judge(positions), self.units
         law, zero = self.law, self.zero
@@ -569,7 +568,7 @@ class FixedPointForce(PairForce):
 
 
 def _closest(model: CutPotential, units: FixedPointUnits) -> float:
-    """Return the smallest r² at which energy, force and virial of a pair are all below 2^50 units."""
+    """Return the smallest r² at which energy, force and virial of a pair are below 2^50 units."""
     r_cut, atom = np.asarray(model.r_cut, np.float64), model.at_cutoff()
     r = r_cut * np.geomspace(1, 1e-3, 4000)[:, None]
     energy, slope = (

@@ -1,4 +1,4 @@
-"""Many-body potentials: energies over a neighbor list, from which forces and stress are derived."""
+"""Many-body potentials: energies over a neighbor list. Forces and stress are their derivatives."""
 
 from __future__ import annotations
 
@@ -32,9 +32,8 @@ _UNKNOWN = Smoothness(-1, float("nan"), float("nan"))
 class ManyBody(eqx.Module):
     """Base class of potentials whose energy is not a sum over pairs.
 
-    Pair decisions are made before the energy is evaluated: the neighbor list contains only pairs inside the
-    cutoff. Neighbor indices equal to the number of atoms are padding. Every potential also tests r < r_cut,
-    so that a neighbor list with a skin gives the same energy.
+    The neighbor list contains only pairs inside the cutoff. Neighbor indices equal to the number of atoms are
+    padding. Every potential also tests r < r_cut, so a neighbor list may have a skin.
 
     Attributes:
         pbc: which axes are periodic.
@@ -81,7 +80,7 @@ class ManyBody(eqx.Module):
         cell: Float[Array, "3 3"],
         deformation: Float[Array, "3 3"],
     ) -> Float[Array, ""]:
-        """Return the energy after multiplying positions and lattice vectors (rows) by a matrix near unity."""
+        """Return the energy after a deformation of positions and lattice vectors (rows)."""
         return self.energy(positions @ deformation, neighbor, cell @ deformation)
 
     def forces(
@@ -112,7 +111,7 @@ class ManyBody(eqx.Module):
 
 
 def leaves_by_path(potential: Any) -> dict[str, Any]:
-    """Return the arrays of a potential by their paths in the pytree, such as "pair.values"."""
+    """Return the arrays of a potential by their paths, such as "pair.values"."""
     leaves, _ = jax.tree_util.tree_flatten_with_path(potential)
     return {jax.tree_util.keystr(path, simple=True, separator="."): leaf for path, leaf in leaves}
 
@@ -129,7 +128,7 @@ def quantities_of(potential: Any) -> dict[str, Any]:
 
 
 def with_quantities(potential: Any, values: Mapping[str, Any]) -> Any:
-    """Return a copy of the potential with other parameter values; the function also works inside jit."""
+    """Return a copy of the potential with other parameter values. It also works inside jit."""
     names, tree = list(leaves_by_path(potential)), jax.tree.structure(potential)
     leaves = [values.get(name, leaf) for name, leaf in zip(names, jax.tree.leaves(potential), strict=True)]
     whole = jax.tree.unflatten(tree, leaves)

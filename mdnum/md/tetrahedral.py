@@ -24,7 +24,7 @@ _UNIT = 2.0**24
 class StillingerWeber(ManyBody):
     """Two- and three-body potential for tetrahedral semiconductors.
 
-    All derivatives are continuous at the cutoff, so that flips change neither the energy nor the forces.
+    All derivatives are continuous at the cutoff. Flips change neither energy nor forces.
 
     The implementation was checked against a plain numpy evaluation (tests/support/oracles_manybody.py).
     Source: Stillinger and Weber, Phys. Rev. B 31, 5262 (1985), eqs. 2.3 to 2.7.
@@ -75,11 +75,11 @@ _LARGEST_EXPONENT = 69.0776
 
 
 class Tersoff(ManyBody):
-    """Bond-order potential for one element; the default constants are set T3 for silicon, named Si(C).
+    """Bond-order potential for one element. The default constants are set T3 for silicon, Si(C).
 
-    Energy and force go to zero at r_cut = R + D, where the derivative of the force jumps. If only the atom
-    that crosses the cutoff affects a bond, the bond order varies as (r_cut - r)^(2n). For n < 1, the force is
-    then continuous with an infinite derivative (in dilute silicon, not in the crystal).
+    Energy and force are zero at r_cut = R + D. The derivative of the force jumps there. If the bond order
+    depends only on the crossing atom, it varies as (r_cut - r)^(2n). For n < 1, the force then has an
+    infinite derivative (in dilute silicon, not in the crystal).
 
     The implementation was checked against ase.calculators.tersoff and a plain numpy evaluation
     (tests/support/oracles_manybody.py). Source: Tersoff, Phys. Rev. B 38, 9902 (1988), eqs. 1 to 3 and table
@@ -121,7 +121,7 @@ class Tersoff(ManyBody):
         return self.R + self.D
 
     def taper(self, r: Float[Array, "..."]) -> Float[Array, "..."]:
-        """Return the taper: 1 for r up to R - D, then a squared sine that falls to exactly 0 at R + D."""
+        """Return the taper: 1 up to R - D, then a squared sine that is 0 at R + D."""
         # (1 - sin(pi x / 2)) / 2 with x = (r - R) / D, in the form that does not cancel where it vanishes
         inward = jnp.clip((self.r_cut - r) / (2 * self.D), 0.0, 1.0)
         return jnp.sin(0.5 * np.pi * inward) ** 2
@@ -176,7 +176,7 @@ _SETS: dict[str, tuple[Any, dict[str, dict[str, Any]]]] = {
 def named(
     kind: str, parameters: str = "Si", pbc: tuple[bool, bool, bool] = (True, True, True)
 ) -> StillingerWeber | Tersoff:
-    """Return the potential "stillinger-weber" or "tersoff" with a set of constants given by name.
+    """Return the potential "stillinger-weber" or "tersoff" with named constants.
 
     Raises:
         InputError: there is no set of constants with this name.

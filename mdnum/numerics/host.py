@@ -1,7 +1,6 @@
-"""Evaluation of jax functions by numpy and scipy, one operation at a time and without compilation.
+"""Evaluation of jax functions by numpy and scipy, without compilation.
 
-The results are a reference for jax: numpy evaluates the same formula with independent code. Operations are
-not compiled, because their compilation would take longer than the rest of a short run.
+The results are an independent reference for jax. Compilation would take longer than the rest of a short run.
 """
 
 from __future__ import annotations
@@ -25,9 +24,9 @@ _NAMES = {
 
 
 def by_numpy(function: Callable[..., Any], *arguments: np.ndarray) -> list[np.ndarray]:
-    """Evaluate a function of arrays by numpy; jax computes operations that numpy and scipy do not have.
+    """Evaluate a function of arrays by numpy. jax computes operations that numpy and scipy lack.
 
-    The error is a few ulps for each elementary function of numpy and scipy.
+    Each elementary function of numpy and scipy has an error of a few ulps.
     """
     with jax.enable_x64(True), np.errstate(all="ignore"):
         program = jax.make_jaxpr(function)(*arguments)

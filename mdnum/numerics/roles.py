@@ -28,12 +28,12 @@ _TOO_SHORT: Mapping[str, str] = {
 
 
 def carrier(name: str) -> np.dtype:
-    """Return the numpy dtype for a dtype name; fixed-point numbers are stored in float64 arrays."""
+    """Return the numpy dtype for a dtype name. Fixed-point numbers are stored in float64."""
     return ALL["float64" if name == FIXED_POINT else name]
 
 
 def check_role(role: str, dtype: str) -> None:
-    """Raise an error if a dtype is not allowed for a role (such as "force") in molecular dynamics.
+    """Raise an error if a dtype is not allowed for a role, such as "force".
 
     Raises:
         InputError: the dtype does not exist, or it has 16 bits and the role requires more.
@@ -79,14 +79,14 @@ class PrecisionPolicy:
         """The dtype of the pair displacements from which forces are computed.
 
         For 32- and 64-bit forces, displacements have the force dtype. For 16-bit forces, displacements have
-        the dtype of cutoff decisions, because 16-bit differences have almost no correct digits.
+        the dtype of cutoff decisions: differences of 16-bit numbers have almost no correct digits.
         """
         return self.dtype("force") if self.force in WIDE else self.dtype("decision")
 
 
 @dataclass(frozen=True)
 class RolePrecision:
-    """The dtypes of all numbers in a bouncing-ball simulation; 16-bit formats are also allowed."""
+    """The dtypes of all numbers in a bouncing-ball simulation. 16-bit formats are also allowed."""
 
     state: str = "float64"  # what is carried from step to step
     arithmetic: str = "float64"  # the operations between one state and the next

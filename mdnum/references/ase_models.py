@@ -1,6 +1,6 @@
-"""Choose the reference calculator for a simulation: the corresponding ASE class if any, or plain numpy.
+"""Choice of the reference calculator for a simulation: an ASE class or plain numpy.
 
-Differences between mdnum and ASE, and conversions of ASE's results that remove these differences:
+ASE's results are converted where ASE differs from mdnum:
 
 | system file | ASE | conversion |
 |---|---|---|
@@ -15,8 +15,8 @@ Differences between mdnum and ASE, and conversions of ASE's results that remove 
 | an energy function | no ASE class | the function on ASE's neighbor list, named in the label |
 | all others | no ASE class | plain numpy on ASE's neighbor list (`independent.py`), named in the label |
 
-ASE's LennardJones keeps a pair at r == rc, but ASE's neighbor lists omit this pair. For shifted and switched
-cutoffs, the energy of a pair at r == rc is zero; only the force can differ.
+ASE's LennardJones keeps a pair at r == rc, but ASE's neighbor lists omit it. The energy of such a pair is
+zero for shifted and switched cutoffs. Only its force can differ.
 """
 
 from __future__ import annotations
@@ -70,7 +70,7 @@ class Reference:
 
 
 def reference(subject: Simulation | System) -> Reference:
-    """Return the best reference for a simulation: an ASE class if there is one, and otherwise plain numpy.
+    """Return an ASE class as reference for a simulation, or plain numpy if there is none.
 
     Args:
         subject: a `Simulation`, or a `System`, whose box may be too small for its skin.
@@ -102,7 +102,7 @@ def reference(subject: Simulation | System) -> Reference:
 
 
 def independent(subject: Simulation | System) -> Reference:
-    """Return a plain-numpy reference for any potential except eam, even if ASE has a class for it."""
+    """Return a plain-numpy reference for any potential except eam, even if ASE has a class."""
     simulation = _objects(subject)
     model, compare = simulation.model, simulation.decider.compare
     if isinstance(model, EnergyFunction):

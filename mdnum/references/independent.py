@@ -1,11 +1,11 @@
-"""Energies, forces and stress from the formulas alone, computed in plain numpy on ASE's neighbor list.
+"""Energies, forces and stress in plain numpy, on ASE's neighbor list.
 
 The numpy code is independent of the code used in a run. Each class of cutoffs has a method `reference` in
-numpy. If ASE has no class for a potential or a cutoff, the numpy code is the only reference.
+numpy. This code is the only reference if ASE has no class for a potential or a cutoff.
 
-A model takes directed edges (i -> j, displacement d) and returns the energy of each atom and the gradient of
-the total energy with respect to every d. Forces and stress follow from the gradient g of the energy with
-respect to the displacements: F_i += g, F_j -= g, stress = sum(g outer d) / volume.
+A model takes directed edges (i -> j, displacement d). It returns the energy of each atom and the gradient of
+the total energy with respect to every d. Forces and stress follow from this gradient g: F_i += g, F_j -= g,
+stress = sum(g outer d) / volume.
 """
 
 from __future__ import annotations
@@ -44,11 +44,10 @@ SLACK = 1e-12  # what `edges_of` adds to the length it is asked for, relative
 
 
 def edges_of(atoms: Atoms, reach: float) -> Edges:
-    """Return the pairs within slightly more than `reach`, in both directions, from ASE's neighbor list.
+    """Return the pairs within slightly more than `reach`, in both directions.
 
-    ASE's PrimitiveNeighborList, which ASE's pair calculators use, is 30 times faster for 500 atoms than ASE's
-    neighbor_list. ASE lists only pairs with r < reach, but the model must also receive pairs with r = reach.
-    The neighbor list therefore contains pairs up to a distance of reach + SLACK.
+    ASE's PrimitiveNeighborList is 30 times faster than its neighbor_list for 500 atoms. ASE omits pairs with
+    r = reach, but the model must receive them. The list therefore contains pairs up to reach + SLACK.
     """
     arrays = (atoms.positions, atoms.numbers, atoms.cell.array, atoms.pbc)
     key = (*(array.tobytes() for array in arrays), reach)
@@ -85,15 +84,15 @@ class Model(ABC):
     @property
     @abstractmethod
     def reach(self) -> float:
-        """Distance beyond which an edge (a directed pair) does not contribute to the energy."""
+        """Distance beyond which a directed pair does not contribute to the energy."""
 
     @abstractmethod
     def __call__(self, edges: Edges) -> tuple[ndarray, ndarray]:
-        """Return (energy of each atom, gradient of the total energy with respect to each displacement)."""
+        """Return (energy of each atom, gradient of the total energy by displacement)."""
 
 
 class ClassicalCalculator(Calculator):
-    """An ASE calculator for energies, forces and stress; energy and free energy are equal."""
+    """An ASE calculator for energy, forces and stress. Energy and free energy are equal."""
 
     implemented_properties = ["energy", "energies", "free_energy", "forces", "stress"]  # noqa: RUF012
     nolabel = True
@@ -105,7 +104,7 @@ class ClassicalCalculator(Calculator):
         self.results = {"free_energy": results["energy"], **results}
 
     def evaluated(self, atoms: Atoms, changes: Sequence[str]) -> dict[str, Any]:
-        """Return energy, forces and stress of a structure; `changes` are the changes since the last call."""
+        """Return energy, forces and stress. `changes` are the changes since the last call."""
         raise NotImplementedError
 
 
@@ -142,7 +141,7 @@ class PairForm:
     compare: str  # what inside means: "r2 <", "r2 <=", "r <" or "r <="
 
     def inside(self, distance: Float[ndarray, "pairs"]) -> Bool[ndarray, "pairs"]:
-        """Return for each distance whether it is inside the cutoff; the system file specifies `<` or `<=`."""
+        """Return for each distance whether it is inside the cutoff, by `<` or `<=` of the system file."""
         space, comparison = self.compare.split()
         quantity, threshold = (distance**2, self.r_cut**2) if space == "r2" else (distance, self.r_cut)
         return quantity <= threshold if comparison == "<=" else quantity < threshold
@@ -153,13 +152,13 @@ class PairForm:
         return _BARE.get(type(self.potential), self.potential.reference)(r, **self.constants)
 
     def __call__(self, r: Float[ndarray, "pairs"]) -> tuple[Float[ndarray, "pairs"], Float[ndarray, "pairs"]]:
-        """Return the energies of pairs with the cutoff applied, and their derivatives with respect to r."""
+        """Return the energies of pairs with the cutoff, and their derivatives with respect to r."""
         at = AtCutoff(self.r_cut, self.r_onset, *self.at_cutoff)
         return CUTOFFS.parse(self.cutoff).reference(r, *self.bare(r), at)
 
     @property
     def at_cutoff(self) -> tuple[float, float]:
-        """Energy u and derivative u' at the cutoff distance, of the potential without cutoff."""
+        """Energy u and derivative u' of the bare potential at the cutoff distance."""
         u, du = self.bare(np.array([self.r_cut]))
         return float(u[0]), float(du[0])
 
@@ -210,14 +209,14 @@ _BARE: dict[type, Callable[..., tuple[ndarray, ndarray]]] = {
 
 @dataclass(frozen=True)
 class PairModel(Model):
-    """A pair potential with any cutoff for each pair of species, or a sum of several such potentials."""
+    """A pair potential with a cutoff for each pair of species, or a sum of such potentials."""
 
     #: for each term, its forms (see `pair_forms`) and the weights of the atoms, None for 1
     terms: Sequence[tuple[Mapping[tuple[str, str], PairForm], Any]]
 
     @classmethod
     def of(cls, model: CutPotential | Channels, symbols: Sequence[str], compare: str) -> PairModel:
-        """Return the model of a potential with cutoff; the arguments are those of `pair_forms`."""
+        """Return the model of a potential with cutoff. The arguments are those of `pair_forms`."""
         parts = model.terms.values()
         weights = [np.asarray(part.weights[0]) if part.weights else None for part in parts]
         forms = [pair_forms(part, symbols, compare) for part in parts]
@@ -228,7 +227,7 @@ class PairModel(Model):
         return max(form.r_cut for forms, _ in self.terms for form in forms.values())
 
     def groups(self, edges: Edges) -> Iterator[tuple[PairForm, ndarray, Any]]:
-        """Yield (interaction, edge indices, weights) of the edges inside the cutoff of each interaction."""
+        """Yield (interaction, edge indices, weights) of the edges inside each cutoff."""
         first, second = edges.symbols[edges.i], edges.symbols[edges.j]
         for forms, weights in self.terms:
             for a, b in product(sorted(set(edges.symbols.tolist())), repeat=2):
@@ -249,7 +248,7 @@ class PairModel(Model):
 
 
 def _triplets(edges: Edges) -> tuple[ndarray, ndarray]:
-    """Return ordered pairs (e, f), e != f, of edges that start from the same atom."""
+    """Return ordered pairs (e, f), e != f, of edges from the same atom."""
     starts = np.searchsorted(edges.i, np.arange(len(edges.symbols) + 1))
     first, second = [], []
     for begin, end in pairwise(starts):
@@ -261,7 +260,7 @@ def _triplets(edges: Edges) -> tuple[ndarray, ndarray]:
 
 
 def _cosines(edges: Edges, e: ndarray, f: ndarray) -> tuple[ndarray, ndarray, ndarray]:
-    """Return cosines of the angles between edges e and f, and their gradients with respect to d_e and d_f."""
+    """Return cosines of the angles between edges e and f. Also return their gradients by d_e and d_f."""
     re, rf = edges.r[e], edges.r[f]
     ne, nf = edges.d[e] / re[:, None], edges.d[f] / rf[:, None]
     cosine = np.einsum("ta,ta->t", ne, nf)
@@ -275,7 +274,7 @@ def _add_rows(target: ndarray, rows: ndarray, values: ndarray) -> None:
 
 @dataclass(frozen=True)
 class _OneSpecies(Model):
-    """A model in which all edges shorter than the cutoff interact, whatever the species of the atoms."""
+    """A model in which all edges inside the cutoff interact, for any species."""
 
     constants: Any  # the potential of `mdnum.md.tetrahedral` whose constants it has
 
@@ -285,7 +284,7 @@ class _OneSpecies(Model):
 
     @abstractmethod
     def within(self, edges: Edges, unit: ndarray) -> tuple[ndarray, ndarray]:
-        """Return the energy of each atom and the gradient with respect to each d, for edges within reach."""
+        """Return the energy of each atom and the gradient by each d, for edges within reach."""
 
     def __call__(self, edges: Edges) -> tuple[ndarray, ndarray]:
         gradient, inside = np.zeros_like(edges.d), edges.r < self.reach

@@ -1,4 +1,4 @@
-"""Building blocks of all pages and terminal output: sections with text, tables and figures.
+"""Elements of pages and terminal output: sections with text, tables and figures.
 
 This module only defines the data of pages. `page` renders sections as HTML; `cli.output` prints sections.
 """
@@ -47,7 +47,7 @@ class Table:
 
 
 def records(rows: Sequence[Mapping[str, Any]], title: str = "", shown: int = 20) -> Table:
-    """Build a table from dictionaries; columns are in the order of their first occurrence."""
+    """Build a table from dictionaries. Columns are in the order of their first occurrence."""
     columns = tuple(dict.fromkeys(name for row in rows for name in row))
     return Table(columns, [[row.get(name) for name in columns] for row in rows], title, shown)
 
@@ -97,7 +97,7 @@ def _is_number(value: Any) -> bool:
 
 @dataclass(frozen=True)
 class Code:
-    """A file or a command to copy; on the report page, the text is folded below its title."""
+    """A file or a command to copy. On the report page it is folded below its title."""
 
     title: str  # what it is
     text: str  # word for word
@@ -121,7 +121,7 @@ ROLES: tuple[Role, ...] = ("first", "second", "third", "bad", "ink", "muted")
 
 
 def positive(values: np.ndarray) -> np.ndarray:
-    """Return values with NaN in place of values that a logarithmic axis cannot show (≤ 0 or not finite)."""
+    """Return values with NaN where a logarithmic axis has no place (≤ 0 or not finite)."""
     values = np.asarray(values, float)
     return np.where(np.isfinite(values) & (values > 0), values, np.nan)
 
@@ -129,7 +129,7 @@ def positive(values: np.ndarray) -> np.ndarray:
 def curves(
     x: np.ndarray, lines: Mapping[str, np.ndarray], mark: Mark = "line", log: bool = True
 ) -> tuple[Series, ...]:
-    """Build a plot series for each line; the position of a line in `lines` determines its style.
+    """Build a plot series for each line. The position of a line in `lines` determines its style.
 
     Args:
         x: positions shared by all lines.
@@ -145,7 +145,7 @@ def curves(
 
 
 def points_of(lines: Iterable[tuple[str, str, str, Any, Any]]) -> dict[str, np.ndarray]:
-    """Return a table with one row for each plotted point in the figures of a run folder.
+    """Return a table with one row for each point in the figures of a run.
 
     Args:
         lines: part, curve, label, x and y of each line.
@@ -160,7 +160,7 @@ def points_of(lines: Iterable[tuple[str, str, str, Any, Any]]) -> dict[str, np.n
 
 @dataclass(frozen=True)
 class Region:
-    """Grid of classified cells: an integer for each cell, and a word for each integer (such as "stable")."""
+    """Grid of cells, with an integer for each cell and a word for each integer (such as "stable")."""
 
     # x, y: centers of the cells, shapes (columns,) and (rows,)
     x: np.ndarray
@@ -172,7 +172,7 @@ class Region:
 
 @dataclass(frozen=True)
 class Plot:
-    """A figure that is described by its data: y values plotted against x values."""
+    """A figure, described by its data."""
 
     name: str  # of figures/<name>.svg, unique on its page
     title: str  # what is seen, a phrase
@@ -244,7 +244,7 @@ class Section:
 
 @dataclass(frozen=True)
 class Key:
-    """A key number shown at the top of a page, with a label and a note."""
+    """A key number at the top of a page, with a label and a note."""
 
     label: str
     value: str

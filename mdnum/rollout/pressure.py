@@ -1,4 +1,4 @@
-"""Components of the pressure in a run, and corrections of the pressure for the cutoff."""
+"""Components of the pressure in a run, and corrections for the cutoff."""
 
 from __future__ import annotations
 
@@ -27,9 +27,9 @@ _SHELL, _MOST = 0.02, 2_000
 class PressureParts:
     """Components of the pressure: kinetic, virial (total and per term) and impulsive.
 
-    The impulsive component is due to the jump of the energy at a cutoff: 2/3 π ρ² g(r_cut) r_cut³ u(r_cut)
-    for one type of pair (Trokhymchuk and Alejandre, J. Chem. Phys. 111, 8510, 1999). Forces and barostats do
-    not include the impulsive component, although it contributes to the pressure of the truncated potential.
+    The impulsive component is due to the energy jump at a cutoff. For one type of pair it is 2/3 π ρ²
+    g(r_cut) r_cut³ u(r_cut) (Trokhymchuk and Alejandre, J. Chem. Phys. 111, 8510, 1999). It is part
+    of the pressure of the truncated potential, but forces and barostats do not include it.
 
     Args:
         samples: for each sampled step, the volume, length³, and the components, energy/length³.
@@ -44,7 +44,7 @@ class PressureParts:
         return self.simulation.jumps()[0] if self.simulation.pairwise else np.zeros(1)
 
     def take(self, segment: Segment) -> None:
-        """Compute the pressure at a segment's last step if the box is periodic and its volume is finite."""
+        """Compute the pressure at a segment's last step. Nothing is computed for a nonperiodic box."""
         simulation, row = self.simulation.in_row(segment.cell_of(segment.rows - 1)), segment.rows - 1
         volume = simulation.cell.volume
         if not (np.isfinite(volume) and all(simulation.pbc)):
@@ -79,8 +79,7 @@ class PressureParts:
     def summary(self) -> dict[str, Any] | None:
         """Return pressures (user units) with standard errors and cutoff corrections; None without samples.
 
-        Standard errors assume independent samples; the correction for pairs beyond the cutoff is evaluated at
-        the mean volume.
+        Standard errors assume independent samples. The cutoff correction uses the mean volume.
         """
         if not self.samples:
             return None
@@ -111,7 +110,7 @@ _OWN = ("volume", "kinetic", "virial", "total")
 def _virials(
     simulation: Simulation, i: Int[np.ndarray, "pairs"], j: Int[np.ndarray, "pairs"], r: np.ndarray
 ) -> Mapping[str, float]:
-    """Return the sum of r · F over pairs for each term; for the argument i, see `Simulation.type_of`."""
+    """Return the sum of r · F over pairs for each term. `Simulation.type_of` explains the argument i."""
     found, channel, i = {}, i // simulation.atoms, i % simulation.atoms
     for number, part in enumerate(simulation.model.parts):
         here = channel == number

@@ -1,4 +1,4 @@
-"""Access to files in a run folder: atomic replacement, rejection of links, and one-line error messages."""
+"""Access to files in a run folder: atomic replacement and rejection of links."""
 
 from __future__ import annotations
 
@@ -56,7 +56,7 @@ def disk_errors(path: Path) -> Iterator[None]:
 
 
 def opened(path: Path, mode: Literal["rb", "r+b", "ab"] = "rb") -> BinaryIO:
-    """Open a file in a run folder; raise an error if the path is a link or not a regular file.
+    """Open a file in a run folder. Raise an error for a link or an irregular file.
 
     Args:
         mode: "r+b" and "ab" write in place, so a file with a second name (a hard link) is also rejected.
@@ -81,7 +81,7 @@ def opened(path: Path, mode: Literal["rb", "r+b", "ab"] = "rb") -> BinaryIO:
 
 
 def refuse_link(path: Path, in_place: bool = False) -> None:
-    """Raise an error if a file in a run folder is a link or not a regular file; a missing file is allowed.
+    """Raise an error for a link or an irregular file. A missing file is allowed.
 
     Args:
         in_place: True if the file will be written in place.
@@ -96,7 +96,7 @@ def refuse_link(path: Path, in_place: bool = False) -> None:
 
 
 def subfolder(root: Path, name: str) -> Path:
-    """Return a subfolder of a run folder; create the subfolder if it does not exist.
+    """Return a subfolder of a run folder. It is created if missing.
 
     Raises:
         FolderError: the subfolder is a link, or cannot be created.
@@ -111,9 +111,9 @@ def subfolder(root: Path, name: str) -> Path:
 
 @contextmanager
 def replacing(path: Path) -> Iterator[BinaryIO]:
-    """Yield a temporary file that replaces the file at `path` when closed, so `path` never has partial data.
+    """Yield a temporary file that replaces the file at `path` when closed.
 
-    A symbolic link at `path` is replaced; the file to which the link refers is not changed.
+    A symbolic link at `path` is replaced. The file behind the link is not changed.
     """
     if path.parent.name in SUBFOLDERS and path.parent.is_symlink():
         raise _linked(path.parent)
@@ -134,7 +134,7 @@ def replacing(path: Path) -> Iterator[BinaryIO]:
 
 
 def write_bytes(path: Path, data: bytes | memoryview) -> None:
-    """Replace the contents of a file; update the folder's manifest if the manifest lists the file.
+    """Replace the contents of a file. Update its entry in the manifest, if any.
 
     Raises:
         FolderError: the disk is full, or the folder cannot be written; no partial file remains.
@@ -146,12 +146,12 @@ def write_bytes(path: Path, data: bytes | memoryview) -> None:
 
 
 def write_text(path: Path, text: str) -> None:
-    """Replace the contents of a file by text in UTF-8; `write_bytes` describes the possible errors."""
+    """Replace the contents of a file by text in UTF-8. `write_bytes` describes the errors."""
     write_bytes(path, text.encode())
 
 
 def read_text(path: Path) -> str:
-    """Return the text of a file in a run folder, or an empty string if the file does not exist.
+    """Return the text of a file in a run folder. "" if the file does not exist.
 
     Raises:
         InputError: the file is a link, is not UTF-8, or is too large.
@@ -197,7 +197,7 @@ _INSIDE = re.compile(rf"(({'|'.join(SUBFOLDERS)})/)?(?!\.{{1,2}}$)[^/\0]+")
 
 @dataclass
 class Manifest:
-    """Manifest of a run folder: its layout, its state, and digests of its files."""
+    """Manifest of a run folder: layout, state and digests of files."""
 
     layout: Layout | None  # what the folder holds; None where an earlier mdnum wrote it, which did not say
     finished: bool = False  # whether its writing came to an end
@@ -212,7 +212,7 @@ def digest_of(data: bytes | memoryview) -> str:
 
 
 def digest(path: Path) -> str:
-    """Return the current digest of a file, or ABSENT if the file does not exist."""
+    """Return the current digest of a file. ABSENT if the file does not exist."""
     try:
         with opened(path) as file:
             return digest_of_file(file)
@@ -230,7 +230,7 @@ def digest_of_file(file: BinaryIO) -> str:
 
 
 def load(root: Path) -> Manifest | None:
-    """Return the manifest of a run folder, or None if the folder has none (older versions wrote none).
+    """Return the manifest of a run folder. None if it has none, as from older versions.
 
     Raises:
         FolderError: the manifest is damaged.
@@ -278,7 +278,7 @@ def update(
     finished: bool | None = None,
     layout: Layout | None = None,
 ) -> None:
-    """Add files to a manifest, remove others, and change its state; do nothing if there is no manifest."""
+    """Add, remove and change entries of a manifest. Do nothing if there is no manifest."""
     made = load(root)
     if made is None:
         return
@@ -293,14 +293,14 @@ def update(
 
 
 def place(path: Path) -> tuple[Path, str]:
-    """Return the run folder of a file, and the name of the file in this folder."""
+    """Return the run folder of a file, and its name there."""
     if path.parent.name in SUBFOLDERS and not (path.parent / NAME).exists():
         return path.parent.parent, f"{path.parent.name}/{path.name}"
     return path.parent, path.name
 
 
 def foretell(path: Path, new: str) -> None:
-    """Add the digest of a file's new contents to the manifest, beside that of its present contents."""
+    """Add the digest of a file's new contents to the manifest. Its present digest stays."""
     root, name = place(path)
     if name == NAME or not (root / NAME).exists():
         return
@@ -324,7 +324,7 @@ def remove(path: Path) -> None:
 
 
 def resumable(root: Path) -> bool:
-    """Return True if a run folder contains a state from which its command can be resumed."""
+    """Return True if a command can be resumed from a run folder."""
     with suppress(FolderError, OSError):
         made = load(root)
         state = "" if made is None or made.layout is None else made.layout.resumes_from
@@ -347,7 +347,7 @@ _RUNS = Path("runs")
 
 
 def default_folder(system: str, runs: Path = _RUNS) -> Path:
-    """Create the new folder runs/NAME-N, where NAME is the system's name and N is the first unused number.
+    """Create the new folder runs/NAME-N with the system's name and the first unused number N.
 
     The folder is created at once, so that simultaneous processes get different folders.
 

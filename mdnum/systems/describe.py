@@ -1,6 +1,6 @@
 """Conversion of a simulation to plain tables, which are stored, hashed and compared.
 
-The tables have the keys of a system file, even if the simulation was made from objects.
+The tables have the keys of a system file, also for simulations from objects.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ if TYPE_CHECKING:
 
 
 def program(simulation: Simulation) -> dict[str, Any]:
-    """Return all parameters and settings of a simulation except its structure, as JSON-compatible tables."""
+    """Return all parameters of a simulation except its structure, as JSON-compatible tables."""
     rule, draw, policy = simulation.rule, simulation.draw, simulation.policy
     tables: dict[str, Any] = {
         "units": simulation.units.name,
@@ -58,7 +58,7 @@ def program(simulation: Simulation) -> dict[str, Any]:
 
 
 def described(simulation: Simulation) -> dict[str, Any]:
-    """Return a description of a simulation's objects, with its name and a digest of the initial state."""
+    """Return a description of a simulation's objects, with a digest of the initial state."""
     formula = simulation.structure.get_chemical_formula()
     return {
         "name": simulation.name,
@@ -82,7 +82,7 @@ def write(simulation: Simulation, folder: Path) -> None:
 
 
 def keys_of(a: Simulation, b: Simulation) -> tuple[dict[str, Any], dict[str, Any]]:
-    """Return tables of two simulations for comparison, from system files if both simulations have one."""
+    """Return tables of two simulations for comparison. They come from system files if both have one."""
     files = [one.origin.system for one in (a, b)]
     if a.file is not None and None not in files:
         first, second = (one.spec.model_dump(mode="json") for one in files if one is not None)
@@ -91,12 +91,12 @@ def keys_of(a: Simulation, b: Simulation) -> tuple[dict[str, Any], dict[str, Any
 
 
 def reduction_word(reduction: Any) -> str:
-    """Return a summation order's name in system files, or its Python representation if it has no name."""
+    """Return a summation order's name in system files, or its representation if it has no name."""
     return next((word for word, known in BY_NAME.items() if known == reduction), repr(reduction))
 
 
 def plain_leaf(leaf: Any) -> Any:
-    """Represent an array by a number, by a list of at most 64 numbers, or by a digest."""
+    """Represent an array by a number, a list of at most 64 numbers, or a digest."""
     array = np.asarray(leaf)
     if array.size == 1:
         return array.reshape(()).item()
@@ -106,7 +106,7 @@ def plain_leaf(leaf: Any) -> Any:
 
 
 def by_pair(simulation: Simulation, leaf: Any) -> Any:
-    """Return one number if all pair types have the same value, otherwise one number per pair of species."""
+    """Return one number if all pair types agree, otherwise one number per pair of species."""
     values = np.asarray(leaf, np.float64)
     if len(set(values.tolist())) == 1:
         return float(values[0])
@@ -127,7 +127,7 @@ def _start(simulation: Simulation) -> str:
 
 
 def _interactions(simulation: Simulation) -> dict[str, Any]:
-    """Return the tables of the potential and its cutoff, or a table for each term of a sum of potentials."""
+    """Return the tables of the potential and its cutoff. A sum of potentials has a table per term."""
     model = simulation.model
     if not simulation.pairwise:
         known = {"kind": model.name, **_leaves(model)}
@@ -168,7 +168,7 @@ def _leaves(tree: Any) -> dict[str, Any]:
 
 
 def _code(function: Any) -> dict[str, Any]:
-    """Return source code and digest of a user's function; without source code, the digest of its bytecode."""
+    """Return source code and digest of a user's function. Without source, the digest is of its bytecode."""
     if function is None:
         return {}
     try:

@@ -1,8 +1,7 @@
-"""Flips of each image (i, j, shift) of a pair, for narrow boxes in which several images can be neighbors.
+"""Flips of each image (i, j, shift) of a pair, for boxes with several images in range.
 
-The ledger of flips identifies an image by its rank in distance, which does not change if atoms are wrapped.
-If one image of a pair leaves and another enters between two frames, the ledger contains no flip, but this
-module counts two flips.
+The ledger of flips identifies an image by its rank in distance. Wrapping does not change it. If one image
+leaves and another enters, the ledger has no flip, but this module counts two.
 """
 
 from __future__ import annotations
@@ -23,7 +22,7 @@ _TOGETHER, _APART = 1_000_000, 256
 
 
 def pair_keys(i: np.ndarray, j: np.ndarray, shifts: np.ndarray, atoms: int) -> Int[np.ndarray, "pairs"]:
-    """Return an integer key for each pair (i, j), or for each image (i, j, shift) if there are shifts."""
+    """Return an integer key for each pair (i, j), or for each image (i, j, shift)."""
     keys = i * np.int64(atoms) + j
     for column in shifts.T:
         keys = keys * _APART + column % _APART
@@ -31,7 +30,7 @@ def pair_keys(i: np.ndarray, j: np.ndarray, shifts: np.ndarray, atoms: int) -> I
 
 
 def cell_of(frame: Frame) -> tuple[Float[np.ndarray, "3 3"], Float[np.ndarray, "3 3"]]:
-    """Return a matrix of lattice vectors as rows (unit normals along nonperiodic axes), and its inverse."""
+    """Return lattice vectors as rows (unit normals along nonperiodic axes), and their inverse."""
     from ase.geometry import complete_cell
 
     matrix = complete_cell(np.where(frame.box.pbc[:, None], frame.box.matrix, 0.0))
@@ -39,10 +38,10 @@ def cell_of(frame: Frame) -> tuple[Float[np.ndarray, "3 3"], Float[np.ndarray, "
 
 
 def image_shifts(frame: Frame, pairs: Any) -> Int[np.ndarray, "pairs 3"]:
-    """Return the lattice shift of an image of j, at x[j] + shift @ box; `rank` images of j are nearer to i.
+    """Return the shift of an image of j at x[j] + shift @ box. `rank` images of j are nearer to i.
 
-    ASE, vesin and jax-md define shifts in the same way. For images of an atom itself, the returned shift has
-    a positive first nonzero component.
+    ASE, vesin and jax-md define shifts in the same way. Images of an atom itself have a positive first
+    nonzero component.
 
     Args:
         pairs: object with arrays i, j, rank and distance, such as `Members`.
@@ -70,7 +69,7 @@ class ImageFlips:
         self._before: tuple[Frame, np.ndarray] | None = None
 
     def step(self, frame: Frame, pairs: Members) -> dict[str, Any] | None:
-        """Return table columns of the flips since the previous frame, or None at the first frame."""
+        """Return columns of the flips since the previous frame. None at the first frame."""
         matrix, inverse = cell_of(frame)
         now = np.column_stack([pairs.i, pairs.j, image_shifts(frame, pairs)])
         known, self._before = self._before, (frame, now)

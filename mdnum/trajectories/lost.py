@@ -1,11 +1,11 @@
-"""Estimate of the number of flips missed because a pair crosses its threshold and returns between frames.
+"""Estimate of the flips missed because a pair returns across its threshold between frames.
 
-Missed flips are flips that would be found if every time step of the run were examined. The four estimates
-(thinning, persistence, velocities and flux) are described in docs/lost-flips.md, with their test systems and
-measured coverage. The estimates by thinning and persistence are extrapolated to shorter frame intervals t.
-The assumed laws for the rate of observed flips are (1 + (t/τ)^p)^(-s/p). The exponent p is 2 for smooth
-atomic motion and 1 for abrupt velocity changes. The exponent s is 1/2 for diffusive motion and 1 for atoms
-that stay at their sites. The estimate is the mean over all laws that fit the data.
+Missed flips are those found only if every time step is examined. docs/lost-flips.md describes the four
+estimates: thinning, persistence, velocities and flux. The estimates by thinning and persistence are
+extrapolated to shorter frame intervals t. The assumed laws for the rate of observed flips are (1 +
+(t/τ)^p)^(-s/p). The exponent p is 2 for smooth motion and 1 for abrupt velocity changes. The exponent s is
+1/2 for diffusion and 1 for atoms that stay at their sites. The estimate is the mean over all laws that fit
+the data.
 """
 
 from __future__ import annotations
@@ -67,7 +67,7 @@ class FrameMotion:
         *,
         timed: bool = True,
     ) -> FrameMotion | None:
-        """Measure displacements between frames; return None if frames are too few or atoms hardly move."""
+        """Measure displacements between frames. None for too few frames or hardly any motion."""
         sides = [slice(None) if one is None else one for one in (first, first if second is None else second)]
         atoms, grid = min(len(sample[0].positions[side]) for side in sides), resolution.usual_step(sample[0])
         pairs = list(pairwise(sample))
@@ -76,7 +76,7 @@ class FrameMotion:
             return None
 
         def variance(ways: Float[np.ndarray, "ways atoms 3"]) -> float:
-            """Return the variance of displacements along one axis, without the mean motion of all atoms."""
+            """Return the variance of displacements along one axis, without the mean motion."""
             free = ways - ways.mean(axis=1, keepdims=True)
             return float(np.mean([(free[:, side] ** 2).mean() for side in sides]))
 
@@ -92,7 +92,7 @@ class FrameMotion:
 
 @dataclass(frozen=True)
 class LostFlips:
-    """Estimate of the flips missed between frames, as a fraction of the true number of flips."""
+    """Estimate of the flips missed between frames, as a fraction of all flips."""
 
     # "none_lost" (every second frame alone would lose no flip), "estimate"; or why there is no number:
     # "rounding" (the file's digits may have made what thinning loses), "open" (too wide a range fits)
@@ -109,7 +109,7 @@ class LostFlips:
 def lost_flips(
     found: Strides, motion: FrameMotion | None = None, flux: Any = None, reach: float = math.nan
 ) -> LostFlips | None:
-    """Estimate the missed flips; return None if no flips, or fewer than three frame intervals, are given.
+    """Estimate the missed flips. None without flips or with fewer than three frame intervals.
 
     Args:
         found: number of flips found at each stride.
@@ -171,7 +171,7 @@ def _of_thinning(found: Strides) -> Estimate:
 
 
 def _carried_on(taken: Float[np.ndarray, "doublings"], error: Float[np.ndarray, "doublings"]) -> Estimate:
-    """Estimate the fraction of flips missed between frames from the flips found if frames are skipped."""
+    """Estimate the fraction of missed flips from the flips found if frames are skipped."""
     misfit = sum(((law - one) / off) ** 2 for law, one, off in zip(_TAKEN, taken, error, strict=False))
     weight = np.exp(np.min(misfit) / 2 - misfit / 2 - _RARE)
     mean = float(np.average(_LOST, weights=weight))

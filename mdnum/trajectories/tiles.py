@@ -1,13 +1,13 @@
-"""Cutoff decisions on all nearby pairs of atoms in each frame, in float32 for sixteen pairs at a time.
+"""Cutoff decisions on all nearby pairs in each frame, in float32 for sixteen pairs at a time.
 
 Atoms are sorted into clusters of sixteen by bisecting space. A tile consists of two clusters and the lattice
-vector between them. For each atom of the first cluster, the tile stores sixteen decisions as bits. At each
-frame, pairs of atoms in nearby clusters are compared with the cutoff in float32. Only decisions that changed
-since the previous frame are processed further. The exact squared distance of a pair is computed if float32
-cannot decide or the pair's margin is needed (`search.exact_square`).
+vector between them. A tile stores sixteen decisions of each atom of the first cluster as bits. At each frame,
+pairs of nearby clusters are compared with the cutoff in float32. Only decisions that changed since the
+previous frame are processed further. If float32 cannot decide or a margin is needed, the exact squared
+distance is computed (`search.exact_square`).
 
-Tiles remain valid as long as all atoms of each cluster stay inside an enlarged bounding box of the cluster.
-Coordinates are unwrapped from frame to frame, so that wrapping in the file does not invalidate tiles.
+Tiles are valid while all atoms of a cluster stay inside an enlarged bounding box. Coordinates are unwrapped,
+so that wrapping in the file does not matter.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ _UNIT = 2.0**-24
 
 
 class Tiled(NamedTuple):
-    """Tiles of atom pairs with the same cutoff radius, with the decision on each pair at the last frame."""
+    """Tiles of pairs with the same cutoff radius, with all decisions at the last frame."""
 
     first: Int[np.ndarray, "tiles"]  # clusters
     second: Int[np.ndarray, "tiles"]
@@ -56,7 +56,7 @@ class _Numbers(NamedTuple):
 
 
 class _Limits(NamedTuple):
-    """Thresholds of distances and squared distances, for all pairs of atoms with the same cutoff radius."""
+    """Thresholds of distances and squared distances for pairs with the same cutoff radius."""
 
     radius: float
     square: float  # of the radius
@@ -83,7 +83,7 @@ class Tiles:
     flips: Changed  # room for them; images further than the nearest do not occur
 
     def serve(self, before: Placed, now: Placed, radius: float, clear: float) -> bool:
-        """Update tiles to a new frame; return True if they contain all pairs closer than radius + `clear`."""
+        """Update tiles to a new frame. Return True if they have all pairs closer than radius + `clear`."""
         if clear + 2.0 * self.doubt(now, radius) > self.clear:
             return False
         change = now.lattice.vectors - before.lattice.vectors
@@ -107,7 +107,7 @@ class Tiles:
         return math.sqrt(most), math.sqrt(second), math.sqrt(total / max(len(now.positions), 1))
 
     def doubt(self, now: Placed, radius: float) -> float:
-        """Return the float32 error bound of a distance near the cutoff radius, in length units."""
+        """Return the float32 error bound of a distance near the cutoff radius (length)."""
         largest = float(np.abs(self.boxes).max(initial=0.0))
         vectors = float(np.abs(now.lattice.vectors).sum())
         # rounding of two coordinates and a shift, of a difference with each, and of the square
@@ -116,7 +116,7 @@ class Tiles:
     def examine(
         self, now: Placed, *, bound: float, horizon: float, pairs: int, record: bool = True
     ) -> tuple[Changed, int, float]:
-        """Decide which pairs are inside the cutoff, for the frame of the last coordinate update.
+        """Decide which pairs are inside the cutoff at the present frame.
 
         Args:
             bound: pairs whose distance deviates from their radius by at most this length are counted.
@@ -163,7 +163,7 @@ class Tiles:
 
 
 def _one_image(before: Placed, now: Placed, radius: float, moved: float) -> bool:
-    """Return True if no pair can have two images inside the cutoff, even if two atoms approach by `moved`."""
+    """Return True if no pair has two images inside the cutoff, even after it approaches by `moved`."""
     return bool((before.lattice.periodic == now.lattice.periodic).all()) and (
         now.lattice.narrowest >= 2.000002 * (radius + 8.0 * now.rounding) + moved
     )
@@ -172,10 +172,10 @@ def _one_image(before: Placed, now: Placed, radius: float, moved: float) -> bool
 def tiles_of(
     before: Placed, now: Placed, who: Participants, clear: float, pairs: int, spare: Tiles | None = None
 ) -> Tiles | None:
-    """Build tiles that are valid at two successive frames, with the decisions of the first frame.
+    """Build tiles for two successive frames, with the decisions of the first.
 
-    No tiles are built if atoms move too far, or the box is too narrow. `pairs` is the approximate number of
-    pairs inside the cutoff. The memory of the old tiles `spare` is reused.
+    None if atoms move too far, or the box is too narrow. `pairs` is the approximate number of pairs inside
+    the cutoff. The memory of the old tiles `spare` is reused.
     """
     radius, lattice, x = who.radius, before.lattice, before.positions
     if not _one_image(before, now, radius, 0.0):
@@ -236,7 +236,7 @@ def tiles_of(
 
 
 def _aligned(clusters: int) -> Float32[np.ndarray, "clusters 3 16"]:
-    """Allocate an array of coordinates, aligned so that no vector spans two cache lines."""
+    """Return an array of coordinates in which no vector spans two cache lines."""
     room = np.empty(3 * CLUSTER * clusters + CLUSTER, np.float32)
     first = -room.ctypes.data % 64 // 4
     return room[first : first + 3 * CLUSTER * clusters].reshape(clusters, 3, CLUSTER)
@@ -251,7 +251,7 @@ def _tiled(
     shifts: Float32[np.ndarray, "27 3"],
     reach: np.float32,
 ) -> Tiled:
-    """Return the tiles of two kinds of atoms whose cluster boxes are closer than `reach`."""
+    """Return the tiles of two kinds of atoms with cluster boxes closer than `reach`."""
     room = 32 * int(runs[a + 1] - runs[a]) + 64
     while True:
         made = np.empty((3, room), np.int32)
@@ -266,9 +266,9 @@ def _tiled(
 
 @njit
 def _halved(x, order):
-    """Sort atoms into compact groups of sixteen, by repeated bisection along the longest edge.
+    """Sort atoms into compact groups of sixteen by repeated bisection along the longest edge.
 
-    Bisection is approximate: an atom in the wrong half costs computing time, but causes no error.
+    An atom in the wrong half costs computing time, but causes no error.
     """
     count, scratch = order.shape[0], np.empty(order.shape[0], np.int32)
     stack, edges = np.empty((64, 2), np.int64), np.empty((64, 6))
@@ -313,9 +313,9 @@ def _halved(x, order):
 
 @njit
 def _nodes(boxes, runs):
-    """For each range of clusters, return a tree of bounding boxes: of the range, of its halves, and so on.
+    """Return a tree of bounding boxes for each range of clusters: the range, its halves, and so on.
 
-    The first half of the clusters of node n is node n + 1; the second half is node n + 2 c, where c is the
+    The first half of the clusters of node n is node n + 1. The second half is node n + 2 c, where c is the
     number of clusters in the first half.
     """
     nodes, spans = np.empty((2 * runs[-1], 6), np.float32), np.empty((2 * runs[-1], 2), np.int64)
@@ -343,7 +343,7 @@ def _nodes(boxes, runs):
 
 @njit
 def _tiles(nodes, runs, a, b, codes, shifts, reach, made):
-    """Write the tiles of two ranges of clusters, as many as the buffer holds; return the number of tiles."""
+    """Write the tiles of two ranges of clusters until the buffer is full. Return the number of tiles."""
     count, square, same = 0, reach * reach, a == b
     stack = np.empty((256, 6), np.int64)
     for code in codes:
@@ -381,7 +381,7 @@ def _tiles(nodes, runs, a, b, codes, shifts, reach, made):
 
 @njit
 def _follow(before, now, order, home, vectors, change, inverse, periodic, center, columns):
-    """Write unwrapped coordinates; return the two largest squared displacements and the sum of all squares.
+    """Write unwrapped coordinates. Return the two largest squared displacements and the sum of all.
 
     The numbers of lattice vectors removed from each atom are stored in `home`.
     """
@@ -424,7 +424,7 @@ def _follow(before, now, order, home, vectors, change, inverse, periodic, center
 
 @njit
 def _stays(boxes, around, drift):
-    """Return True if each cluster's box is inside its enlarged box, at least `drift` from every face."""
+    """Return True if each cluster stays inside its enlarged box, at least `drift` from every face."""
     out = 0
     for k in range(boxes.shape[0]):
         for c in range(3):
@@ -446,7 +446,7 @@ def _box(columns, boxes):
 
 @njit
 def _examine(tiled, begin, columns, boxes, shifts, numbers, limits, flips, count):
-    """Decide pairs of tiles `begin` and later; return (next tile, flips, uncertain pairs, least |margin|)."""
+    """Decide pairs from tile `begin`. Return (next tile, flips, uncertain pairs, least |margin|)."""
     close, smallest, room = 0, np.inf, flips.i.shape[0]
     first, second, vector, rows, inside = tiled.first, tiled.second, tiled.vector, tiled.rows, tiled.inside
     order, low, high, scratch = numbers.order, limits.low, limits.high, np.empty(4 * CLUSTER, np.float32)

@@ -1,4 +1,4 @@
-"""The commands `mdnum fork certify` and `mdnum fork processes`: exact arithmetic and program variants."""
+"""The commands `mdnum fork certify` (exact arithmetic) and `mdnum fork processes`."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ def fork_certify(
     policies: Mapping[str, Any] | None = None,
     **keep: Unpack[Keep],
 ) -> Outcome:
-    """Find, for each precision, the first step at which decisions differ from those of exact arithmetic.
+    """Find the first step at which decisions differ from exact arithmetic, for each precision.
 
     Example:
         >>> mdnum.fork_certify("argon/crystal-108", steps=100)
@@ -89,7 +89,7 @@ def fork_certify(
 
 
 def _ranking(answer: Answer) -> list[dict[str, Any]]:
-    """Return the ranking of precisions; store tables of the ranking and of distances from the exact run."""
+    """Return the ranking of precisions. Store it and the distances from the exact run as tables."""
     ranking, rows, table = answer.result.ranking, [], []
     for row in ranking:
         decision, growth, separation = row.decision, row.growth, row.separation
@@ -111,7 +111,7 @@ def _ranking(answer: Answer) -> list[dict[str, Any]]:
 
 
 def _lines(name: str, lines: Mapping[str, np.ndarray], first: int = 0) -> dict[str, Any]:
-    """Join named series of distances between runs into a table with the columns name, step and separation."""
+    """Join named series of distances into a table with the columns name, step and separation."""
     return {
         name: np.concatenate([np.full(len(line), key) for key, line in lines.items()]),
         "step": np.concatenate([first + np.arange(len(line)) for line in lines.values()]),
@@ -120,7 +120,7 @@ def _lines(name: str, lines: Mapping[str, np.ndarray], first: int = 0) -> dict[s
 
 
 def _ambiguous(simulation: Any, answer: Answer) -> dict[str, Any]:
-    """For each precision, count and exactly evaluate the decisions with margins below rounding bounds."""
+    """Count the decisions with margins below rounding bounds, and evaluate them exactly."""
     from mdnum.forks.certified import certified_horizon
     from mdnum.numerics import PrecisionPolicy
 
@@ -135,7 +135,7 @@ def _ambiguous(simulation: Any, answer: Answer) -> dict[str, Any]:
 
 
 def judge_certify(view: View) -> Verdict:
-    """Return the verdict: for each precision, the steps in which decisions agree with exact arithmetic."""
+    """Return the verdict: for how many steps the decisions of each precision are exact."""
     s = view.summary
     rows = [row for row in s["policies"] if row["reason_unavailable"] is None]
     left = [row for row in rows if row["horizon"] is not None]
@@ -154,7 +154,7 @@ def judge_certify(view: View) -> Verdict:
 
 
 def _gains(s: Mapping[str, Any], roles: Sequence[str]) -> Iterator[str]:
-    """Yield sentences on how the precision of a quantity changes the number of steps with exact decisions."""
+    """Yield sentences on how precision changes the number of steps with exact decisions."""
     rows = s["policies"]
     by_dtype = {kind: next((row for row in rows if all(row[role] == kind for role in roles)), None)
                 for kind in ("float32", "float64")}  # fmt: skip
@@ -229,7 +229,7 @@ def page_certify(view: View, verdict: Verdict) -> Page:
 
 
 def _drawn(table: Mapping[str, np.ndarray], labels: Mapping[str, str]) -> tuple[Series, ...]:
-    """Return a plot series for each selected name in a table that `_lines` made."""
+    """Return a plot series for each selected name in a table of `_lines`."""
     names = next(iter(table.values()))
     steps = np.unique(table["step"])
     lines = {label: np.full(len(steps), np.nan) for label in labels.values()}
@@ -240,7 +240,7 @@ def _drawn(table: Mapping[str, np.ndarray], labels: Mapping[str, str]) -> tuple[
 
 
 def _bars(s: Mapping[str, Any], figure: Canvas) -> None:
-    """Draw a bar for each precision; the bar's length is the number of steps with exact decisions."""
+    """Draw a bar for each precision. Its length is the number of steps with exact decisions."""
     axes, rows, last = figure.subplots(), s["policies"], s["steps"]
     place = np.arange(len(rows))[::-1]
     ends = [last if row["horizon"] is None else row["horizon"] for row in rows]
@@ -266,7 +266,7 @@ def fork_processes(
     which: Sequence[Variant] | None = None,
     **keep: Unpack[Keep],
 ) -> Outcome:
-    """Run a system in several ways (jit, eager, batched, differentiated, XLA flags); compare the results.
+    """Run a system in several ways (jit, eager, batched, differentiated, XLA flags). Compare results.
 
     Example:
         >>> mdnum.fork_processes("argon/crystal-108", steps=100)
@@ -327,7 +327,7 @@ def _cause(code: str, names: Sequence[str] = (), program: str = "", **values: An
 
 
 def judge_processes(view: View) -> Verdict:
-    """Return the verdict: the number of different trajectories that the variants of one program compute."""
+    """Return the verdict: the number of different trajectories of one program."""
     s = view.summary
     seeds = [row["first_bit"] for row in s["variants"] if row["first_bit"] is not None]
     ran, clusters = len(s["variants"]) - len(s["failed_variants"]), len(s["clusters"])

@@ -25,7 +25,7 @@ _INSIDE = {True: "yes", False: "no", None: "not decided"}
 
 
 def _shown(view: View, name: str) -> str:
-    """Shorten the path in the name of a measure as far as possible while the name remains unique."""
+    """Shorten the path in a measure's name as long as the name is unique."""
     parts, others = Path(name).parts, [one["name"] for one in view.summary["measures"] if one["name"] != name]
     ends = ["/".join(parts[-k:]) for k in range(1, len(parts))] if ".py:" in name else []
     return next((end for end in ends if not any(one.endswith(f"/{end}") for one in others)), name)
@@ -37,7 +37,7 @@ def _unit(view: View, name: str) -> str:
 
 
 def _moved(view: View) -> dict[str, list[str]]:
-    """Return, for each varied choice, the names of the physical measures that it changes significantly."""
+    """Return for each varied choice the physical measures that it changes significantly."""
     found: dict[str, list[str]] = {axis["key"]: [] for axis in view.summary["axes"]}
     physical = {one["name"] for one in view.summary["measures"] if one["physical"]}
     for row in view.summary["differences"]:
@@ -48,7 +48,7 @@ def _moved(view: View) -> dict[str, list[str]]:
 
 
 def judge(view: View) -> Verdict:
-    """Return the verdict on a sweep: varied choices that change results, and recommended values."""
+    """Return the verdict on a sweep: choices that change results, and recommended values."""
     s = view.summary
     moved = _moved(view)
     said = [TEXTS("moves", key=key, measures=listed(names)) for key, names in moved.items() if names]
@@ -122,7 +122,7 @@ def _advised(view: View, advice: Mapping[str, Any]) -> str:
 
 
 def _further_seeds(view: View, factor: float) -> int:
-    """Return the number of random seeds to add so that the number of all seeds grows by the given factor."""
+    """Return how many seeds to add so that their number grows by the given factor."""
     return int(np.ceil(len(view.summary["seeds"]) * (factor - 1)))
 
 
@@ -179,13 +179,13 @@ def _sections(view: View) -> Iterator[Section]:
 def _most(
     rows: Sequence[Any], columns: Mapping[str, str], stored: str, bad: Callable[[Any], Any] | None = None
 ) -> list[Any]:
-    """Return a table of the first rows; if there are more rows, a note before the table names their file."""
+    """Return a table of the first rows. A note names the file if there are more."""
     more = [TEXTS("more_rows", shown=_ROWS, all=len(rows), stored=stored)] if len(rows) > _ROWS else []
     return [*more, table_of(rows[:_ROWS], columns, bad=bad)]
 
 
 def _several(words: Sequence[str], separator: str = ", ") -> str:
-    """Join words; if there are many, show the first three, the last, and the number of words."""
+    """Join words. Of many words, show the first three, the last, and their number."""
     if len(words) <= _VALUES:
         return separator.join(words)
     return TEXTS("many_values", first=separator.join(words[:3]), last=words[-1], n=len(words))
@@ -208,7 +208,7 @@ def _differences(view: View) -> list[Any]:
 
 
 def _with_error(row: Mapping[str, Any]) -> str:
-    """Format a value and its error; the value is rounded to the digits that its error allows."""
+    """Format a value and its error. The error determines the digits."""
     value, error = row["value"], row["error"]
     if not error:
         return number(value, 5)
@@ -238,7 +238,7 @@ def _settings(view: View) -> list[Any]:
 
 
 def _plots(view: View, axis: Mapping[str, Any]) -> Iterator[Plot]:
-    """Yield figures of each measure versus the values of one choice; other choices keep their base values."""
+    """Yield figures of each measure versus one choice. Other choices keep their base values."""
     s, values = view.summary, axis["values"]
     if not all(isinstance(one, int | float) for one in values):
         return

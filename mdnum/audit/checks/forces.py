@@ -1,4 +1,4 @@
-"""Compare forces with finite differences of the energy, with a step that suits the calculator's noise."""
+"""Compare forces with finite differences of the energy. The step suits the calculator's noise."""
 
 from __future__ import annotations
 
@@ -54,7 +54,7 @@ Displacement = Float[np.ndarray, "atoms 3"]
 
 @dataclass(frozen=True)
 class Slope:
-    """Derivative of the energy along a direction, computed from finite differences and from the forces."""
+    """Derivative of the energy along a direction, from finite differences and from forces."""
 
     direction: str  # in words
     difference: float  # by differences of the energy, eV/Å
@@ -72,23 +72,23 @@ class Slope:
 
     @property
     def agrees(self) -> bool:
-        """True if the force agrees with the finite difference of the energy within its estimated error."""
+        """True if force and finite difference agree within the estimated error."""
         return self.gap <= _SIGNIFICANT * self.error
 
 
 class ForcesCheck(AuditCheck):
-    """Are the forces minus the gradient of the energy, and is this energy `energy` or `free_energy`?
+    """Are the forces minus the gradient of `energy` or of `free_energy`?
 
     The slope of the energy is a finite difference D(h). Its error is estimated as |D(h) - D(h/4)| plus
-    noise/h. Of nine steps h, the one with the smallest error is used. If the deviation of a finite difference
-    from the force is proportional to 1/h, the check reports a jump of the energy, not a wrong force.
+    noise/h. Of nine steps h, the one with the smallest error is used. If a deviation is proportional to 1/h,
+    the finding is an energy jump, not a wrong force.
     """
 
     name, title, order, basic, calls = "forces", "Forces", 10, True, 500
     needed_to = ("run", "differentiate")
 
     def ask(self, subject: CalculatorSubject, progress: Progress) -> CheckResult:
-        """Compare forces with central differences of the energy; test whether net force and torque vanish."""
+        """Compare forces with central differences of the energy. Test the net force and torque."""
         rng = np.random.default_rng(self.seed)
         worker = subject.fresh()
         ways = Ways()
@@ -185,7 +185,7 @@ class ForcesCheck(AuditCheck):
 
 
 def _fewer(subject: CalculatorSubject, atoms: Atoms, rng: np.random.Generator) -> tuple[Atoms, NoiseFloor]:
-    """Return a nonperiodic cluster of the atoms nearest to the first atom, and its noise level."""
+    """Return a nonperiodic cluster around the first atom, and its noise level."""
     away = atoms.get_distances(0, range(len(atoms)), mic=bool(atoms.pbc.any()), vector=True)
     nearest = np.sort(np.argsort(np.linalg.norm(away, axis=1))[:_CLUSTER])
     there = Atoms(atoms.numbers[nearest], away[nearest])
@@ -199,7 +199,7 @@ def _worst(slopes: list[Slope]) -> Slope:
 
 
 def _directions(atoms: Atoms, rng: np.random.Generator) -> Iterator[tuple[str, Displacement]]:
-    """Yield random displacements of all atoms, and displacements of a few single atoms along each axis."""
+    """Yield random displacements of all atoms, and of a few single atoms along each axis."""
     for number in range(_DIRECTIONS):
         yield f"all atoms at random, {number + 1}", direction(len(atoms), rng)
     for who in sorted(rng.permutation(len(atoms))[:_ATOMS]):
@@ -217,7 +217,7 @@ def slope(
     noise: NoiseFloor,
     what: str = "",
 ) -> Slope:
-    """Derivative of the energy along a line, from finite differences (with its error) and from the forces.
+    """Derivative of the energy along a line, from finite differences (with error) and from forces.
 
     Args:
         line: displacement of the atoms per Å of step; `what` is the name of the line.
@@ -257,11 +257,10 @@ def slope(
 def _best(
     gaps: Float[np.ndarray, "steps"], error: Float[np.ndarray, "steps"], rounding: Float[np.ndarray, "steps"]
 ) -> tuple[int, float]:
-    """Find the most accurate finite difference that other steps confirm; return its index and its error.
+    """Find the most accurate finite difference that other steps confirm. Return its index and error.
 
-    If the energy jumps at flips, finite differences with two step lengths may by chance contain the same
-    jumps, and agree on a wrong slope. A wrong force, in contrast, causes equal deviations for all
-    sufficiently accurate finite-difference steps.
+    Two step lengths may contain the same energy jump by chance, and agree on a wrong slope. A wrong force
+    causes equal deviations for all sufficiently accurate steps.
 
     Args:
         gaps: finite difference minus force for each step, from the longest step to the shortest.
@@ -281,7 +280,7 @@ def _best(
 
 
 def _sums(atoms: Atoms, forces: Displacement, noise: NoiseFloor) -> Iterator[dict[str, Any]]:
-    """Net force of a structure, and net torque if nonperiodic; for a correct calculator, both are zero."""
+    """Net force of a structure, and its net torque if nonperiodic. Both should be zero."""
     size = float(np.sum(np.abs(forces)))
     allowed = noise.allowed.force * np.sqrt(len(atoms)) + 40 * np.finfo(float).eps * size
     net = float(np.linalg.norm(forces.sum(axis=0)))
@@ -296,7 +295,7 @@ def _sums(atoms: Atoms, forces: Displacement, noise: NoiseFloor) -> Iterator[dic
 def _drowned(
     worker: CalculatorSubject, atoms: Atoms, noise: NoiseFloor, known: float, scale: float
 ) -> list[Observed]:
-    """Return a finding if the calculator's noise is so large that it hides forces or energy changes."""
+    """Return a finding if the noise hides forces or energy changes."""
     stairs = steps(worker, atoms)  # which are another finding
     size = max(noise.force, 0.0 if stairs.energy else known)
     if size <= max(_DROWNED * scale, stairs.force):
@@ -342,7 +341,7 @@ def _row(one: Slope) -> dict[str, Any]:
 
 
 def _chart(slopes: list[Slope]) -> Chart:
-    """Chart of force error versus finite-difference step: correct forces give a minimum, others a plateau."""
+    """Chart of force error versus step. Correct forces give a minimum, others a plateau."""
     shown = slopes[:_DIRECTIONS]
     shown += [one for one in [_worst(slopes)] if one not in shown]
     lines = {one.direction: one.gaps[::-1].tolist() for one in shown}
@@ -357,10 +356,10 @@ def _chart(slopes: list[Slope]) -> Chart:
 def _two_energies(
     subject: CalculatorSubject, atoms: Atoms, noise: NoiseFloor, line: Displacement, along: Slope
 ) -> Iterator[Observed]:
-    """Yield a finding if the energies `energy` and `free_energy` differ by more than a constant.
+    """Yield a finding if `energy` and `free_energy` differ by more than a constant.
 
     By ASE's definition, the forces are minus the gradient of `free_energy`. All other checks examine
-    `free_energy`. If `energy` and `free_energy` differ by at most a constant, the findings hold for both.
+    `free_energy`. If the two energies differ by a constant, the findings hold for both.
     """
     free, logged = subject.energies(atoms)
     if logged is None:

@@ -1,8 +1,7 @@
 """A conformance suite that compares any neighbor list with an exact brute-force search.
 
-`examine` runs all test cases on a neighbor list, and `load` finds a neighbor list by name.
-`NeighborListConformance` is a class to subclass in the tests of a library. `cases` and `boxes` are hypothesis
-strategies for further tests.
+`examine` runs all test cases. `load` finds a neighbor list by name. `NeighborListConformance` is a class to
+subclass in the tests of a library. `cases` and `boxes` are hypothesis strategies for further tests.
 """
 
 from __future__ import annotations

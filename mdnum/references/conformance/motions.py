@@ -1,12 +1,10 @@
-"""Test updatable neighbor lists with sequences of the smallest motions that require a rebuild of the list.
+"""Sequences of the smallest motions that require a rebuild of a neighbor list.
 
-Two atoms just beyond r_cut + padding when the list is built are inside the cutoff after they have approached
-by the padding. The smallest such motion is along the line between the atoms. A rebuild criterion is
-sufficient if it detects every approach of two atoms by the padding, in any direction and for any motion of
-other atoms. Each sequence of `motions` brings a pair closer by slightly more than the padding. Sequences
-differ in direction (axis, diagonal, random), in the distance that each of the two atoms moves, and in time
-(one step, slowly, back and forth). Other atoms are absent, at rest, or move slightly, in parallel or with a
-common drift.
+Two atoms start just beyond r_cut + padding. After they approach by the padding, they are inside the cutoff.
+The smallest such motion is along the line between the atoms. A rebuild criterion must detect every approach
+of two atoms by the padding. Each sequence brings a pair closer by slightly more than the padding. Sequences
+differ in direction (axis, diagonal, random), in the division of the motion between the two atoms, and in time
+(one step, slowly, back and forth). Other atoms are absent, at rest, move slightly, or drift together.
 """
 
 from __future__ import annotations
@@ -47,7 +45,7 @@ def movers() -> Iterator[Case]:
 
 
 def sequences() -> Iterator[Case]:
-    """Yield sequences for a neighbor list that is built at each call, to test that it keeps no state."""
+    """Yield sequences for a list that is built at each call, to test that it keeps no state."""
     for case in _reuse():
         yield replace(case, skin=0.0)
 
@@ -58,7 +56,7 @@ def _two(apart: float) -> ndarray:
 
 
 def _beside(apart: float) -> ndarray:
-    """Return the positions of two atoms at a given distance along x; the first atom is at `_MIDDLE`."""
+    """Return two atoms at a given distance along x. The first is at `_MIDDLE`."""
     return np.array([_MIDDLE, _MIDDLE + np.array([apart, 0, 0])])
 
 
@@ -166,7 +164,7 @@ def _strain() -> Script:
 
 
 def _narrow() -> Iterator[Case]:
-    """Yield boxes so narrow that several images of a pair, or of an atom itself, are within the cutoff."""
+    """Yield narrow boxes with several images of a pair, or of one atom, within the cutoff."""
     skewed = np.array([[0.9, 0, 0], [0.5, 0.8, 0], [-0.4, 0.3, 0.85]])
     for word, count, cell, pbc in (
         ("an atom alone, edges of 0.8 cutoffs", 1, 0.8, True),
@@ -205,7 +203,7 @@ def _reuse() -> Iterator[Case]:
 
 
 def _anew(name: str, path: list[Any], skins: Sequence[float | None] | None = None) -> Case:
-    """Return a test case with a new list at every step, or only at steps for which `skins` gives a skin."""
+    """Return a test case with a new list at every step, or where `skins` gives a skin."""
     case = sequence(name, "reuse", path, _L, _R, max(filter(None, skins)) if skins else _SKIN)
     starts = zip(case.stills, skins or [None] * len(path), strict=True)
     stills = (replace(still, fresh=skin is not None or not skins, skin=skin) for still, skin in starts)
@@ -213,7 +211,7 @@ def _anew(name: str, path: list[Any], skins: Sequence[float | None] | None = Non
 
 
 def motions(padding: float | None = None) -> Iterator[Case]:
-    """Yield sequences of small motions that require a rebuild of the list, short sequences first.
+    """Yield sequences of small motions that require a rebuild, short sequences first.
 
     Args:
         padding: measured or declared padding of the list, in units of the given skin; if None, the given skin
@@ -267,7 +265,7 @@ def motions(padding: float | None = None) -> Iterator[Case]:
 
 
 def _ways() -> list[ndarray]:
-    """Return unit vectors along axes, along face and body diagonals, and in random directions."""
+    """Return unit vectors along axes, face and body diagonals, and random directions."""
     ways = [np.array(way, float) for way in itertools.product((-1, 0, 1), repeat=3) if way > (0, 0, 0)]
     ways.sort(key=lambda way: (np.count_nonzero(way), tuple(-way)))
     ways += list(np.random.default_rng(140).normal(size=(3, 3)))
@@ -275,12 +273,12 @@ def _ways() -> list[ndarray]:
 
 
 def _closing(room: float) -> float:
-    """Return the distance by which two atoms approach, from beyond r_cut + padding to inside the cutoff."""
+    """Return how far two atoms approach, from beyond r_cut + padding to inside the cutoff."""
     return (1 + 2 * HAIR) * room
 
 
 def _around(middle: ndarray, room: float | ndarray, way: ndarray) -> ndarray:
-    """Return pairs just beyond r_cut + padding: the first atoms of all pairs, then their partners."""
+    """Return pairs just beyond r_cut + padding: all first atoms, then all partners."""
     half = (_R + (1 + HAIR) * room) / 2 * way
     return np.vstack([middle - half, middle + half])
 
@@ -288,16 +286,16 @@ def _around(middle: ndarray, room: float | ndarray, way: ndarray) -> ndarray:
 def _walk(
     room: float, way: ndarray, share: float, edge: float, n: int, closed: Iterable[float] = (0.0, 1.0)
 ) -> list[ndarray]:
-    """Return a path of two approaching atoms; the first moves by the fraction `share` of the approach."""
+    """Return a path of two approaching atoms. The first moves by the fraction `share`."""
     start = _around(edge * np.random.default_rng(150 + n).uniform(0.2, 0.8, 3), room, way)
     moves = _closing(room) * np.array([share * way, (share - 1.0) * way])
     return [start + part * moves for part in closed]
 
 
 def _squeezed(room: float, way: ndarray, edge: float, n: int, along: bool) -> list[tuple[ndarray, ndarray]]:
-    """Return a path on which only the strain of the box brings two atoms together.
+    """Return a path on which only strain of the box brings two atoms together.
 
-    The box shrinks along the direction between the two atoms, or along all axes.
+    The box shrinks along the line between the atoms, or along all axes.
     """
     (start, _), cell = _walk(room, way, 0.5, edge, n), edge * np.eye(3)
     loss = _closing(room) / (_R + (1 + HAIR) * room)
@@ -306,10 +304,10 @@ def _squeezed(room: float, way: ndarray, edge: float, n: int, along: bool) -> li
 
 
 def _among(room: float, way: ndarray, edge: float, n: int, count: int, little: float) -> list[ndarray]:
-    """Return a path on which two of many atoms approach each other; the others rest or move slightly.
+    """Return a path on which two of many atoms approach. The others rest or move slightly.
 
-    The number `n` determines how the motion is divided between the two atoms. All atom indices are used
-    equally often for the atom that moves most; the index of its partner is random.
+    The number `n` determines how the motion is divided between the two atoms. All atoms are used equally
+    often as the atom that moves most. Its partner is random.
     """
     rng = np.random.default_rng(170 + n)
     most = int(count * (1.0 - (n + 1) * _GOLDEN % 1.0))
@@ -323,7 +321,7 @@ def _among(room: float, way: ndarray, edge: float, n: int, count: int, little: f
 
 
 def _adrift(room: float, way: ndarray, edge: float, n: int) -> list[ndarray]:
-    """Return a path of two approaching atoms among ten others; all twelve atoms also drift together."""
+    """Return a path of two approaching atoms among ten others. All twelve drift together."""
     start, end = _with(gas(12, edge, 180 + n), [4, 5], _walk(room, way, 0.5, edge, n))
     across = np.cross(way, np.roll(way, 1) + np.array([0.3, -0.2, 0.1]))
     across /= np.linalg.norm(across)
@@ -339,14 +337,14 @@ def _with(others: ndarray, atoms: list[int], path: list[ndarray]) -> list[ndarra
 
 
 def _dozen(room: float, way: ndarray, share: float, n: int) -> list[ndarray]:
-    """Return a path on which twelve pairs at different positions make the same motion."""
+    """Return a path on which twelve pairs make the same motion at different positions."""
     start = _around(_places(12, 12.0, n), room, way)
     moves = _closing(room) * np.repeat([share * way, (share - 1.0) * way], 12, axis=0)
     return [start, start + moves]
 
 
 def _in_turn(room: float, ways: list[ndarray]) -> Case:
-    """Return a test case in which 50 atoms (25 pairs) move in turn, to find atoms that a list ignores."""
+    """Return a test case in which 50 atoms move in turn, to find atoms that a list ignores."""
     count = 25
     way = np.array([ways[n % len(ways)] for n in range(count)])
     start = _around(_places(count, 15.0, 0), room, way)
@@ -364,7 +362,7 @@ def _in_turn(room: float, ways: list[ndarray]) -> Case:
 
 
 def _ladder(room: float, way: ndarray, n: int) -> Case:
-    """Return a test case in which pairs of atoms approach each other until each pair is inside the cutoff."""
+    """Return a test case in which pairs approach until each is inside the cutoff."""
     start = _around(_places(len(_RUNGS), 12.0, n), room * _RUNGS[:, None], way)
     inward = np.repeat([0.5 * way, -0.5 * way], len(_RUNGS), axis=0)
     path = [start + _closing(room) * closed * inward for closed in (0.0, *_RUNGS)]
@@ -373,7 +371,7 @@ def _ladder(room: float, way: ndarray, n: int) -> Case:
 
 
 def _one_by_one(room: float, way: ndarray, share: float, n: int) -> Case:
-    """Return a test case in which the atoms of one pair after another approach each other and return."""
+    """Return a test case in which one pair after another approaches and returns."""
     count = len(_RUNGS)
     start = _around(_places(count, 12.0, n + 1), room * _RUNGS[:, None], way)
     path = [start]
@@ -400,7 +398,7 @@ def _places(count: int, edge: float, n: int) -> ndarray:
 
 
 def _sequence(name: str, paths: Iterable[list[Any]], cell: float | ndarray, skin: float = _SKIN) -> Case:
-    """Return a test case of successive motions, separated by large moves that force a rebuild."""
+    """Return a test case of successive motions. Large moves between them force a rebuild."""
     paths = list(paths)
     case = sequence(name, "rule", [still for path in paths for still in path], cell, _R, skin)
     return replace(case, motions=len(paths))
