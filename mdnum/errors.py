@@ -1,4 +1,4 @@
-"""Exceptions with messages that state what was found, what was expected, and a remedy."""
+"""Exceptions whose messages state what was found, expected, and a remedy."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ def json_escape(character: str) -> str:
 def printable(text: str, escape: Callable[[str], str] = python_escape) -> str:
     """Escape all characters of untrusted text that a terminal would interpret.
 
-    Control characters, except line ends and tabs, are written in Python notation, such as ``\\x1b``.
+    Control characters are written in Python notation, such as ``\x1b``. Line ends and tabs are kept.
     Characters that reorder or hide text are escaped, too.
     """
     return _CONTROL.sub(lambda found: escape(found[0]), text)
@@ -90,7 +90,7 @@ def _restored(kind: type[MdnumError], args: tuple[Any, ...], held: dict[str, Any
 
 
 class InputError(MdnumError):
-    """Raised if user input (a system file, an option, a structure) cannot be used."""
+    """Raised if a system file, an option or a structure cannot be used."""
 
 
 class FolderError(InputError):
@@ -114,7 +114,7 @@ class NumericalError(MdnumError):
 
 
 def in_a_line(error: BaseException) -> str:
-    """Return the type and the message of an exception from another package in one line."""
+    """Return the type and message of another package's exception in one line."""
     words = " ".join(str(error).split())[:300]
     return f"{type(error).__name__}: {words}" if words else type(error).__name__
 
@@ -131,7 +131,7 @@ def expect_at_least(least: int, **numbers: int) -> None:
 
 
 def expect_path(given: object, remedy: str) -> None:
-    """Raise an error if an argument that must be a path is an object of another type.
+    """Raise an error if a path is an object of another type.
 
     Raises:
         InputError: the object is not a path; the message contains its type and shape, but not its contents.

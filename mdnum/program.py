@@ -1,11 +1,9 @@
-"""Interface by which analyses, such as the search for forks, run and compare simulations.
+"""Interface by which analyses run and compare simulations.
 
-Molecular dynamics, the bouncing ball and simulations of other packages implement the interface `Program`. An
-object with this interface, called a program, determines every bit of a run, including its initial state.
-Analyses, such as the search for forks, use only the interface `Program`. Every time step takes its
-decisions, such as whether a pair is inside the cutoff, as input. The decisions of one program can therefore
-be recorded and imposed on another program. The implementations are `mdnum.rollout.program.MdProgram` and
-`mdnum.ball.program.BallProgram`.
+Molecular dynamics, the ball and simulations of other packages implement `Program`. A program determines every
+bit of a run, including its initial state. Analyses, such as the search for forks, use only the interface
+`Program`. Every time step takes its decisions as input. Decisions of one program can therefore be imposed on
+another. The implementations are `mdnum.rollout.program.MdProgram` and `mdnum.ball.program.BallProgram`.
 """
 
 from __future__ import annotations
@@ -22,7 +20,7 @@ Progress = Callable[[int, int, dict[str, Any]], None]
 
 
 class Program(Protocol):
-    """Protocol of a simulation that can be run, perturbed, and compared with another simulation.
+    """Protocol of a simulation that can be run, perturbed and compared.
 
     Attributes:
         size: number of atoms or balls.
@@ -50,7 +48,7 @@ class Program(Protocol):
     def imposable(self) -> str | None: ...
 
     def check(self, other: Any) -> None:
-        """Raise an error if two programs differ in number of atoms or balls, or in kinds of decisions.
+        """Raise an error if two programs differ in atoms, balls or kinds of decisions.
 
         Raises:
             InputError: the programs cannot be compared.
@@ -60,7 +58,7 @@ class Program(Protocol):
     def lockstep(
         self, other: Any, last: int, *, forward: bool, back: bool, guard: float | None
     ) -> Iterator[PairRows]:
-        """Run this program (A) and another program (B) together, and compare them step by step.
+        """Run this program (A) and another one (B), and compare each step.
 
         Args:
             forward: whether to run also B with A's decisions imposed, "B|A".
@@ -73,7 +71,7 @@ class Program(Protocol):
     def repeats(
         self, others: Sequence[Any], last: int, tolerance: float, guard: float
     ) -> list[tuple[Float[np.ndarray, "steps"], Float[np.ndarray, "steps"]]]:
-        """Return distances of perturbed runs from this run, without and with this run's decisions imposed.
+        """Return distances of perturbed runs from this run, with and without imposed decisions.
 
         Args:
             others: the same program with perturbed starts.
@@ -97,7 +95,7 @@ class Program(Protocol):
         ...
 
     def number(self, key: str) -> Number:
-        """Return a numerical parameter of the system, given its key in the system file.
+        """Return a number of the system, given its key in the system file.
 
         Raises:
             InputError: no parameter or several parameters match; the message lists the known parameters.
@@ -105,11 +103,11 @@ class Program(Protocol):
         ...
 
     def history(self, steps: int, loss: Callable[..., float] | None = None) -> DecisionHistory:
-        """Return the decisions and the final state of a run with a given number of steps."""
+        """Return the decisions and the final state of a run."""
         ...
 
     def differing(self, other: Any, steps: int, step: int, key: str) -> Differing:
-        """Return the decision that differs between this program and another program at a step."""
+        """Return the decision that differs between two programs at a step."""
         ...
 
 
@@ -162,7 +160,7 @@ class PairRows:
         return len(self.cross)
 
     def until(self, last: int) -> PairRows:
-        """Return the part of the record from the start up to a time step."""
+        """Return the record up to a time step."""
         rows = last - self.first + 1
         if rows >= self.rows:
             return self
@@ -215,7 +213,7 @@ class Decision:
 
     @property
     def margin(self) -> float:
-        """Margin (threshold minus quantity) in run `run`, or in run A if the runs differ from the start."""
+        """Margin (threshold minus quantity) in run `run`, or in run A."""
         return self.margins["A" if self.run == "start" else self.run]
 
     @property
@@ -249,7 +247,7 @@ class Number:
 
 @dataclass(frozen=True)
 class DecisionHistory:
-    """Decisions of a run at each time step, and the final state of the run."""
+    """Decisions of a run at each step, and its final state."""
 
     # of each step, a number that any other decisions of that step have different (up to collisions of 64
     # bits); shorter where the run failed, shape (rows,)
@@ -263,7 +261,7 @@ class DecisionHistory:
     first: int = 0  # step of the first row
 
     def first_difference(self, other: DecisionHistory) -> int | None:
-        """Return the first step at which the decisions of two runs differ, or None if they never differ."""
+        """Return the first step at which two runs' decisions differ, or None."""
         common = min(len(self.marks), len(other.marks))
         differ = np.flatnonzero(self.marks[:common] != other.marks[:common])
         if len(differ):
@@ -273,7 +271,7 @@ class DecisionHistory:
 
 @dataclass(frozen=True)
 class Differing:
-    """Decision that differs at a step between two simulations with slightly different parameter values."""
+    """Decision that differs between simulations with slightly different parameters."""
 
     # the one whose margin is closest to 0 on both sides; a, b, margins and bounds are those of the two
     # programs

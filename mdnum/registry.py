@@ -1,12 +1,12 @@
 """Registries of named objects (cutoffs, integrators, methods) from mdnum and from other packages.
 
-A registry maps a name to a *value*: an object, or a class or function that creates an object. Another package
-adds a value to a registry by an entry point in the registry's group, for example:
+A registry maps a name to a *value*: an object, or what creates it. Another package adds a value by an entry
+point in the registry's group:
 
     [project.entry-points."mdnum.cutoffs"]
     "smooth-cubic" = "my_package.cutoffs:SmoothCubic"
 
-A package that adds a name is imported only when this name is used or described.
+The package is imported only when the name is used or described.
 """
 
 from __future__ import annotations
@@ -29,14 +29,14 @@ _LONGEST_WORD = 100
 
 
 def meant(word: str, known: Iterable[str]) -> str:
-    """Return "Did you mean ...? " with the most similar known name, or "" if no name is similar."""
+    """Return "Did you mean ...? " with the most similar name, or ""."""
     folded = {option.lower(): option for option in known if len(word) <= _LONGEST_WORD}
     close = difflib.get_close_matches(word.lower(), folded, n=1)
     return f"Did you mean {folded[close[0]]}? " if close else ""
 
 
 def unknown(noun: str, word: str, known: Iterable[str], *, where: str | None = None) -> InputError:
-    """Return the error for an unknown name, with the most similar known name and a list of known names."""
+    """Return the error for an unknown name, with a list of known names."""
     known = list(known)
     remedy = f"{meant(word, known)}Choose from {', '.join(known)}"
     return InputError(f"unknown {noun} {word!r}", remedy=remedy, where=where)
@@ -62,7 +62,7 @@ def _plugins(group: str, path: tuple[str, ...]) -> tuple[metadata.EntryPoint, ..
 
 @dataclass(frozen=True)
 class Registry(Generic[T]):
-    """Mapping from names to values in the order of registration; values of other packages come last."""
+    """Mapping from names to values. Values of other packages come last."""
 
     noun: str  # what one of them is called, for messages
     group: str  # entry points by which other packages add theirs
@@ -75,7 +75,7 @@ class Registry(Generic[T]):
     _descriptions: dict[str, str] = field(default_factory=dict, repr=False)
 
     def add(self, name: str, value: Any = None, *, description: str | None = None) -> Any:
-        """Add a value of mdnum to the registry, or decorate a class or function to add it.
+        """Add a value of mdnum, or decorate a class or function to add it.
 
         Args:
             name: name that users write.
@@ -119,7 +119,7 @@ class Registry(Generic[T]):
         return name in self._own or name in self._added()
 
     def place(self, name: str) -> str:
-        """Return the name of the module that is registered under a name, without importing the module.
+        """Return the module that is registered under a name, without importing it.
 
         Raises:
             InputError: there is no such name.
@@ -169,8 +169,8 @@ class Registry(Generic[T]):
     def parse(self, text: str) -> T:
         """Return the value for a text of the form "name" or "name=argument".
 
-        A class or function is called with the text of the argument, if any. If a class has a method `parse`,
-        the argument is passed to this method. Any other value is returned and cannot have an argument.
+        A class or function is called with the argument, if any. A class may have a method `parse` for the
+        argument. Any other value is returned and cannot have an argument.
 
         Raises:
             InputError: the name is unknown, or an argument is unexpected or missing.
@@ -201,7 +201,7 @@ class Registry(Generic[T]):
         return (inspect.getdoc(value) or "").partition("\n")[0].rstrip(".")
 
     def package(self, name: str) -> str:
-        """Return the name of the package that provides the value with a given name."""
+        """Return the package that provides the value with a name."""
         return "mdnum" if name in self._own else _package(self._added()[name])
 
 

@@ -1,10 +1,9 @@
-"""Locate jumps and kinks of a curve by scanning and zooming, down to adjacent floating-point numbers.
+"""Locate jumps and kinks of a curve, down to adjacent floating-point numbers.
 
-A curve consists of an energy and the force along one coordinate. Each energy and force is predicted from the
-points to the left and, independently, from the points to the right. Where the curve is smooth, the difference
-between the two predictions falls with the fourth power of the point spacing. At a kink, the difference
-between the predictions falls only linearly with the spacing, and at a jump the difference does not fall. The
-decrease of the difference with the spacing therefore identifies the kind of singularity.
+A curve consists of an energy and the force along one coordinate. Each value is predicted twice: from the
+points to its left and to its right. On a smooth curve, the predictions' difference falls with the fourth
+power of the spacing. At a kink, it falls only linearly, and at a jump not at all. This decrease identifies
+the kind of singularity.
 """
 
 from __future__ import annotations
@@ -40,7 +39,7 @@ SMOOTH = 3  # order of a threshold at which neither energy, force nor curvature 
 
 
 class Curve:
-    """Energy and force along one coordinate; results are stored, so that no point is evaluated twice.
+    """Energy and force along one coordinate. No point is evaluated twice.
 
     Args:
         at: function that returns (energy, force = -dE/dx) at a coordinate.
@@ -63,7 +62,7 @@ class Curve:
 
 
 def bisect(question: Callable[[float], bool], low: float, high: float) -> tuple[float, float]:
-    """Find adjacent doubles between which a condition changes from true to false or from false to true."""
+    """Find adjacent doubles between which a condition changes."""
     before = question(low)
     while True:
         middle = low + 0.5 * (high - low)
@@ -81,9 +80,9 @@ def grid(low: float, high: float, step: float) -> Float[np.ndarray, "points"]:
 
 
 def scatter(curve: Curve, low: float, high: float, room: float) -> Float[np.ndarray, "2 2"]:
-    """Estimate the noise of energy and force (two columns) just below `low` and just above `high` (two rows).
+    """Estimate the noise of energy and force (columns) below `low` and above `high` (rows).
 
-    The largest estimate of several spacings is used, because float32 values at close points can be equal.
+    Of several spacings, the largest estimate counts, as close float32 values can be equal.
     """
     sides = []
     for start, sign in ((low, -1.0), (high, 1.0)):
@@ -99,7 +98,7 @@ def scatter(curve: Curve, low: float, high: float, room: float) -> Float[np.ndar
 
 
 def slope(curve: Curve, start: float, sign: int, room: float, noise: float) -> tuple[float, float]:
-    """Return the one-sided derivative dF/dx at `start`, and its error, for the spacing of smallest error."""
+    """Return the one-sided derivative dF/dx at `start`, and its error."""
     best = (0.0, np.inf)
     for relative in _WIDTHS:
         width = max(abs(start), 1.0) * relative
@@ -114,7 +113,7 @@ def slope(curve: Curve, start: float, sign: int, room: float, noise: float) -> t
 
 
 def _bend(curve: Curve, start: float, sign: int, room: float) -> float:
-    """Estimate the magnitude of the second derivative of the force on one side of a coordinate."""
+    """Estimate the size of the force's second derivative on one side."""
     width = min(1e-3 * max(abs(start), 1.0), room / 4)
     force = curve.many(start + sign * width * np.arange(3))[1]
     return abs(float(force[0] - 2 * force[1] + force[2])) / width**2
@@ -159,12 +158,12 @@ def find_jumps(
     expected: Sequence[float] = (),
     calls: float = np.inf,
 ) -> tuple[list[Jump], int]:
-    """Find jumps of the energy or of its first three derivatives that exceed the noise of a scan.
+    """Find jumps of the energy and its derivatives that exceed the noise.
 
     The smallest detectable jump depends on the curvature of the curve. The function `smallest_steps` returns
     the smallest detectable jump of the force. At a spacing of 0.025 Å, the scan finds 199 of 200 force jumps
-    of 1e-6 eV/Å at random distances in five potentials. It finds all larger jumps. The smallest energy jumps
-    found are 3e-6 eV on a repulsive wall of ε = 1 eV, and 1e-8 eV on a soft wall.
+    of 1e-6 eV/Å in five potentials. It finds all larger jumps. It finds energy jumps of 3e-6 eV on a
+    repulsive wall of ε = 1 eV, and of 1e-8 eV on a soft wall.
 
     Args:
         curve: energy and force, which must be defined slightly beyond both ends.
@@ -200,10 +199,10 @@ def find_jumps(
 
 
 def measure(curve: Curve, low: float, high: float, room: float, exact: bool, curved: bool = True) -> Jump:
-    """Measure the jumps between `low` and `high`, and the jumps that a smooth curve would show there.
+    """Measure the jumps between `low` and `high`, and those of a smooth curve.
 
-    Energy and force on either side are medians over the four nearest coordinates, so that a single rounding
-    error has no effect. The curvature is computed from one-sided differences of the force.
+    Values on either side are medians of four, so that one rounding error has no effect. The curvature is
+    computed from one-sided differences of the force.
 
     Args:
         room: length, on either side, within which the curve may be evaluated.
@@ -231,7 +230,7 @@ def measure(curve: Curve, low: float, high: float, room: float, exact: bool, cur
 
 
 def decay_power(curve: Curve, edge: float, room: float) -> float | None:
-    """Return the power p of the force |F| ~ (edge - x)^p near `edge`; None if the power is unclear.
+    """Return the power p of |F| ~ (edge - x)^p near `edge`. None if it is unclear.
 
     Args:
         edge: end of the interaction, approached from smaller distances; no other threshold is within `room`.
@@ -252,7 +251,7 @@ def decay_power(curve: Curve, edge: float, room: float) -> float | None:
 def smallest_steps(
     curve: Curve, low: float, high: float, step: float
 ) -> tuple[Float[np.ndarray, "intervals"], Float[np.ndarray, "intervals"]]:
-    """Return the intervals scanned by `find_jumps`, and the smallest detectable force jump in each interval.
+    """Return the scanned intervals, and the smallest detectable force jump in each.
 
     Returns:
         (midpoints of the compared intervals, smallest detectable force step in each interval, eV/Å).
@@ -303,11 +302,11 @@ def _outliers(
 
 
 def _mismatch(curve: Curve, places: Float[np.ndarray, "points"]) -> Float[np.ndarray, "3 intervals"]:
-    """Return three mismatches for each interval, which are small where the curve is smooth.
+    """Return three mismatches for each interval. They are small on a smooth curve.
 
-    The first two mismatches, of energy and of force, are differences at the midpoint between predictions from
-    left and right. The third mismatch, energy change plus work of the force, falls with the fifth power of
-    the spacing on a smooth curve. The third mismatch detects the smallest jumps of the energy alone.
+    The first two are differences of the predictions of energy and force. The third, energy change plus work,
+    falls with the fifth power of the spacing. The third mismatch detects the smallest jumps of the energy
+    alone.
     """
     values = curve.many(places)
     windows = np.lib.stride_tricks.sliding_window_view(values, 4, axis=1)
@@ -319,7 +318,7 @@ def _mismatch(curve: Curve, places: Float[np.ndarray, "points"]) -> Float[np.nda
 
 
 def _zoom(curve: Curve, left: float, right: float) -> list[Jump]:
-    """Find the jumps between `left` and `right`; locate jumps of energy or force to two adjacent doubles."""
+    """Find the jumps between `left` and `right`, down to two adjacent doubles."""
     room = right - left
     left, right = left - 1.5 * room, right + 1.5 * room
     noise = np.maximum(scatter(curve, left, right, room).max(axis=0), 1e-300)
@@ -362,7 +361,7 @@ def _zoom(curve: Curve, left: float, right: float) -> list[Jump]:
 
 
 def locate(curve: Curve, row: int, left: float, right: float) -> tuple[float, float]:
-    """Bisect to the adjacent doubles between which energy or force jumps from its left to its right value.
+    """Bisect to the adjacent doubles between which energy or force jumps.
 
     Args:
         row: 0 for the energy minus the work done since the left end, 1 for the force.
@@ -374,7 +373,7 @@ def locate(curve: Curve, row: int, left: float, right: float) -> tuple[float, fl
 
 
 def _level(curve: Curve, row: int, left: float, right: float) -> Callable[[float], float]:
-    """Remove the smooth change from the energy or force; the returned function changes only at jumps."""
+    """Remove the smooth change from the energy or force. Only jumps remain."""
     if row == 1:
         back = left - (right - left)
         slope_before = (curve(left)[1] - curve(back)[1]) / (left - back)
@@ -383,7 +382,7 @@ def _level(curve: Curve, row: int, left: float, right: float) -> Callable[[float
 
 
 def _kink(curve: Curve, left: float, right: float, room: float) -> list[Jump]:
-    """Locate a kink of the force: the point at which the extrapolations from both sides intersect."""
+    """Locate a kink of the force, where both sides' extrapolations intersect."""
     width = min(room / 8, 1e-3)
     middle, reach = 0.5 * (left + right), max(0.5 * (right - left), width / 8)
     roots = np.roots(-_pieces(curve, middle, reach, width, 3))
@@ -396,16 +395,16 @@ def _kink(curve: Curve, left: float, right: float, room: float) -> list[Jump]:
 
 
 def _pieces(curve: Curve, middle: float, reach: float, width: float, degree: int) -> np.ndarray:
-    """Difference between polynomials fitted to the force at seven points above and seven below `middle`."""
+    """Difference of two polynomials, fitted to the force above and below `middle`."""
     steps = reach + width * np.arange(7)
     before = np.polyfit(-steps, curve.many(middle - steps)[1], degree)
     return np.polyfit(steps, curve.many(middle + steps)[1], degree) - before
 
 
 def _third(curve: Curve, left: float, right: float, room: float, noise: float) -> list[Jump]:
-    """Locate a jump of the energy's third derivative, using the force's second derivative on both sides.
+    """Locate a jump of the energy's third derivative.
 
-    Of several fit widths, the one is used for which half the width gives the most similar result.
+    The fit width is the one for which half of it changes the result least.
     """
     reach = 0.5 * (right - left)
     widths = [room / part for part in (6, 12, 24, 48) if room / part > 4 * reach]

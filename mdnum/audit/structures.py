@@ -1,4 +1,4 @@
-"""Structures used by an audit: a structure read from a file, or two particles on a line."""
+"""Structures of an audit: read from a file, or two particles."""
 
 from __future__ import annotations
 
@@ -24,10 +24,9 @@ _NEAREST = 0.3  # distances are walked from the first
 
 
 def read_structure(words: str | Path) -> Atoms:
-    """Read a structure with ASE; `file@5` selects the sixth structure of a file, and `file` the last one.
+    """Read a structure with ASE. `file@5` is the sixth structure, `file` the last one.
 
-    The text after @ is passed to ASE and must select exactly one structure: an index (negative indices count
-    from the end) or a database selection (`file.db@id=3`).
+    The text after @ is an index or a database selection (`file.db@id=3`). It must select one structure.
 
     Raises:
         InputError: the file is missing, ASE cannot read it, it has no atoms, or a number is not finite.
@@ -72,7 +71,7 @@ def read_structure(words: str | Path) -> Atoms:
 
 @dataclass(frozen=True)
 class Pair:
-    """Two particles (single atoms or whole molecules) that can be placed at any distance from each other."""
+    """Two particles (atoms or molecules) at any distance from each other."""
 
     species: tuple[str, str]  # symbols of the two reference atoms; molecules by the heaviest of their atoms
     first: Atoms  # the particle that stays, its reference atom at the origin
@@ -84,7 +83,7 @@ class Pair:
     moves: Literal["atom", "molecule"] = "atom"
 
     def at(self, distance: float) -> Atoms:
-        """Return the two particles with their reference atoms at exactly the given distance, unrounded."""
+        """Return the particles with their reference atoms at exactly this distance."""
         both = self._together.copy()
         both.positions[len(self.first) :, 0] += distance
         return both
@@ -94,7 +93,7 @@ class Pair:
         return self.surrounded(self.first + self.second)
 
     def surrounded(self, atoms: Atoms, middle: bool = False) -> Atoms:
-        """Put atoms into the cell of the two particles; if `middle`, move them to the center of this cell."""
+        """Put atoms into the cell of the particles. If `middle`, center them."""
         if self.box:
             atoms.set_cell([self.box] * 3)
             if middle:
@@ -103,12 +102,12 @@ class Pair:
         return atoms
 
     def others(self, distance: float) -> Float[np.ndarray, "pairs"]:
-        """Return the distances between atoms of the two particles, except between the two reference atoms."""
+        """Return the distances between the particles' other atoms."""
         moved = self.second.positions[None] + [distance, 0.0, 0.0]
         return np.linalg.norm(moved - self.first.positions[:, None], axis=2).ravel()[1:]
 
     def curve(self, subject: CalculatorSubject) -> Curve:
-        """Energy as a function of distance, and the force on the second particle, positive if repulsive."""
+        """Energy by distance, and the force on the second particle. Repulsion is positive."""
 
         def at(distance: float) -> tuple[float, float]:
             energy, forces = subject.both(self.at(distance))
@@ -118,11 +117,11 @@ class Pair:
 
 
 def pairs(subject: CalculatorSubject, most: int = 6) -> tuple[list[Pair], list[Skipped]]:
-    """Return a pair of particles for every two supported species, in descending order of frequency.
+    """Return a pair of particles for every two species, frequent species first.
 
-    A pair consists of single atoms if the calculator supports single atoms at the smallest distance in the
-    structure. If single atoms fail, each gets two companion atoms, since a bond-order potential may divide by
-    the number of neighbors. If companion atoms fail too, as for rigid water, the pair consists of molecules.
+    A particle is a single atom if the calculator supports this. Otherwise, each atom gets two companions:
+    some potentials divide by the number of neighbors. If this fails too, as for rigid water, molecules are
+    used.
 
     Returns:
         (pairs, omitted pairs with the reason).
@@ -150,7 +149,7 @@ def pairs(subject: CalculatorSubject, most: int = 6) -> tuple[list[Pair], list[S
 
 
 def modified(atoms: Atoms, scaled: bool = False, **values: Any) -> Atoms:
-    """Return a modified copy of a structure; if `scaled`, the positions are scaled with the cell."""
+    """Return a modified copy of a structure. If `scaled`, positions follow the cell."""
     there = atoms.copy()
     if "cell" in values:
         there.set_cell(values.pop("cell"), scale_atoms=scaled)
@@ -160,7 +159,7 @@ def modified(atoms: Atoms, scaled: bool = False, **values: Any) -> Atoms:
 
 
 def exchanged(before: Atoms, after: Atoms) -> tuple[tuple[int, int], ...]:
-    """Return (atom, k) for each atom whose k-th and (k+1)-th nearest neighbors have swapped order."""
+    """Return (atom, k) if the k-th and the next neighbor of an atom have swapped order."""
     orders = []
     for atoms in (before, after):
         distances = atoms.get_all_distances(mic=bool(atoms.pbc.any()))
@@ -175,7 +174,7 @@ def exchanged(before: Atoms, after: Atoms) -> tuple[tuple[int, int], ...]:
 
 
 def nearest_distance(atoms: Atoms) -> float:
-    """Smallest distance between two of the first 500 atoms of a structure; 0 for a single atom."""
+    """Smallest distance among the first 500 atoms. 0 for a single atom."""
     if len(atoms) < 2:
         return 0.0
     distances = atoms[: min(len(atoms), 500)].get_all_distances(mic=bool(atoms.pbc.any()))
@@ -183,13 +182,13 @@ def nearest_distance(atoms: Atoms) -> float:
 
 
 def trio(symbol: str, side: float, way: float) -> Atoms:
-    """Return an atom at the origin and two companion atoms behind it, at equal distances."""
+    """Return an atom at the origin, and two companions behind it."""
     depth = way * side * np.sqrt(0.75)
     return Atoms([symbol] * 3, [(0, 0, 0), (depth, side / 2, 0), (depth, -side / 2, 0)])
 
 
 def molecules(atoms: Atoms) -> list[np.ndarray]:
-    """Return the atom indices of each molecule; two atoms are bonded if their covalent radii nearly touch."""
+    """Return the atoms of each molecule. Atoms are bonded if their covalent radii nearly touch."""
     from ase.neighborlist import natural_cutoffs, neighbor_list
     from scipy.sparse import coo_array
     from scipy.sparse.csgraph import connected_components
@@ -202,7 +201,7 @@ def molecules(atoms: Atoms) -> list[np.ndarray]:
 
 
 def whole(atoms: Atoms, indices: np.ndarray) -> Atoms:
-    """Return one molecule, unwrapped and without a cell, with its heaviest atom at the origin."""
+    """Return one unwrapped molecule with its heaviest atom at the origin."""
     part = _part(atoms, indices)
     lead = int(np.argmax(part.get_masses()))
     offsets = part.get_distances(lead, np.arange(len(part)), mic=bool(atoms.pbc.any()), vector=True)
@@ -216,7 +215,7 @@ def _part(atoms: Atoms, indices: np.ndarray) -> Atoms:
 
 
 def _molecules(subject: CalculatorSubject) -> list[Pair]:
-    """Return a pair of molecules of the structure, identical if possible; no pair for a single molecule."""
+    """Return a pair of molecules, identical if possible. No pair for a single molecule."""
     atoms, groups = subject.atoms, molecules(subject.atoms)
     if not 2 <= len(groups) <= len(atoms) / 2:
         return []
@@ -231,7 +230,7 @@ def _molecules(subject: CalculatorSubject) -> list[Pair]:
 def _answered(
     subject: CalculatorSubject, species: tuple[str, str], first: Atoms, second: Atoms, nearest: float
 ) -> tuple[Pair | None, str]:
-    """Return two particles in the simplest cell the calculator supports, or None and the error message."""
+    """Return particles in the simplest cell that works, or None and the error message."""
     why = ""
     for cell, periodic in _SURROUNDINGS:
         name = "-".join(part.get_chemical_formula() for part in (first, second))
@@ -246,7 +245,7 @@ def _answered(
 
 
 def coarse_scan(subject: CalculatorSubject, curve: Curve) -> tuple[Float[np.ndarray, "points"], float]:
-    """Return the scan distances at which the calculator does not fail, and the largest of these distances."""
+    """Return the distances at which the calculator works, and the largest of them."""
     places = np.concatenate([np.arange(_NEAREST, 3.0, 0.1), np.arange(3.0, FARTHEST + 0.1, 0.25)])
     first = len(places)
     for k in range(len(places) - 1, -1, -1):
@@ -262,10 +261,10 @@ def coarse_scan(subject: CalculatorSubject, curve: Curve) -> tuple[Float[np.ndar
 
 
 def group(atoms: Atoms) -> int | None:
-    """Return the number of atoms per molecule for a structure of identical molecules; otherwise None.
+    """Return the number of atoms per molecule. None if molecules differ.
 
-    A repeating sequence of species does not imply molecules: a salt crystal can have such a sequence too. The
-    atoms of a molecule must be bonded to one another (by covalent radii) and to no other atoms.
+    A salt crystal can have a repeating sequence of species, too. Atoms of a molecule must be bonded (by
+    covalent radii) to one another only.
     """
     numbers = atoms.numbers
     if len(set(numbers)) < 2:

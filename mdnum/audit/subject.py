@@ -1,4 +1,4 @@
-"""Wrapper of an ASE calculator for audits: it returns up-to-date results or raises a clear error."""
+"""Wrapper of an ASE calculator that returns up-to-date results or raises an error."""
 
 from __future__ import annotations
 
@@ -49,7 +49,7 @@ class RepeatCounts:
 
 
 class Repeats:
-    """Hashes of all structures, with their energies and forces, for the comparison of repeated evaluations.
+    """Energies and forces by structure (as a hash), to compare repeated evaluations.
 
     Attributes:
         new: statistics of the first results of new calculator objects, which remember no other structure.
@@ -62,7 +62,7 @@ class Repeats:
         self._known: dict[tuple[bytes, str], tuple[float, int]] = {}
 
     def compare(self, atoms: Atoms, which: int, what: Literal["energy", "force"], value: float) -> None:
-        """Compare the first energy or force from one calculator object with that from an earlier object."""
+        """Compare the result of a calculator object with that of an earlier object."""
         before, first = self._known.setdefault((_question(atoms), what), (value, which))
         self.new.times += first != which
         if first != which and value != before:
@@ -70,7 +70,7 @@ class Repeats:
             setattr(self.new, what, max(abs(value - before), getattr(self.new, what)))
 
     def findings(self, kT: float) -> list[Observed]:
-        """Return a finding if repeated evaluations of one structure differ by more than rounding errors."""
+        """Return a finding if repeated evaluations differ by more than rounding errors."""
         for seen, who in ((self.chance, "same"), (self.new, "new")):
             if seen.differ:
                 told = not_repeatable(
@@ -83,7 +83,7 @@ class Repeats:
 
 
 def no_rounding(change: float, force: float, answer: EnergyForces, kT: float) -> bool:
-    """Return whether an energy change (eV) or force change (eV/Å) is too large to be a rounding error."""
+    """Return whether a change of energy (eV) or force (eV/Å) exceeds rounding errors."""
     energy, forces = answer
     return change > max(_LARGE_ENERGY * kT, _LARGE_SHARE * abs(energy)) or (
         forces is not None and force > _LARGE * rms(forces)
@@ -91,7 +91,7 @@ def no_rounding(change: float, force: float, answer: EnergyForces, kT: float) ->
 
 
 def differences(one: EnergyForces, other: EnergyForces) -> tuple[float, float]:
-    """Return the absolute energy difference and the largest force component difference (0 without forces)."""
+    """Return the difference of the energies, and the largest of the force components. 0 if no forces."""
     forces = None if one[1] is None or other[1] is None else other[1] - one[1]
     return abs(other[0] - one[0]), 0.0 if forces is None else largest(forces)
 
@@ -99,7 +99,7 @@ def differences(one: EnergyForces, other: EnergyForces) -> tuple[float, float]:
 def not_repeatable(
     how: str, energy: float, force: float, typical: float, kT: float, **values: Any
 ) -> Observed:
-    """Report that two evaluations of one structure differ, as an error if the cause cannot be rounding.
+    """Report that two evaluations of one structure differ. Only rounding is no error.
 
     Args:
         how: how the difference was discovered, as the name of a text variant.
@@ -127,11 +127,10 @@ class LoadedCalculator:
 class CalculatorSubject:
     """An ASE calculator and the structure for which it is audited.
 
-    ASE returns its cached energy if no coordinate moved by more than 1e-15 Å. A smaller move can change a
-    coordinate near zero, so this class clears the cache after any change. If the input did not change, cached
-    energies and forces are used; the method `forget` forces another calculation. The calculator is attached
-    to the atoms, as in a run, since some calculators require this. An evaluation raises a `CalculatorError`
-    if the calculator raised an exception or returned nan. The structure is then saved.
+    ASE returns its cached energy after moves below 1e-15 Å. This class therefore clears the cache after any
+    change. If the input did not change, cached results are used. `forget` forces a calculation. The
+    calculator is attached to the atoms, as in a run. A `CalculatorError` is raised if the calculator fails or
+    returns nan. The structure is then saved.
 
     Args:
         name: the calculator as the user named it.
@@ -182,14 +181,14 @@ class CalculatorSubject:
         return self._calculator
 
     def fresh(self) -> CalculatorSubject:
-        """Return a copy of the subject with a new calculator object that has evaluated no structure yet."""
+        """Return a copy of the subject with a new calculator object."""
         other = copy.copy(self)
         other.forgets = other.renews = other.copies = True
         other._calculator = other._last = None
         return other
 
     def used(self) -> CalculatorSubject:
-        """Return a copy that does not clear the cache, to test whether a calculator detects new input."""
+        """Return a copy that does not clear the cache."""
         other = self.fresh()
         other.forgets = other.renews = False
         return other
@@ -209,10 +208,9 @@ class CalculatorSubject:
         return self.energies(atoms)[0]
 
     def energies(self, atoms: Atoms) -> tuple[float, float | None]:
-        """Return (the energy consistent with the forces, the energy that a run writes to its log), eV.
+        """Return (energy consistent with the forces, energy written to the log), eV.
 
-        ASE calls the energy consistent with the forces `free_energy` and the logged energy `energy`; the
-        logged energy is None if a calculator has only one energy.
+        In ASE they are `free_energy` and `energy`. The logged energy is None if there is only one.
         """
         asked = self._ask(atoms)
         both = self._answer(lambda: self._energies(asked), asked, "energy")
@@ -223,7 +221,7 @@ class CalculatorSubject:
         return energy, other
 
     def forces(self, atoms: Atoms) -> Forces:
-        """Return the forces (eV/Å); raise an error if the calculator fails or the array shape is wrong."""
+        """Return the forces (eV/Å). Raise an error if the array shape is wrong."""
         asked = self._ask(atoms)
         forces = np.array(self._answer(asked.get_forces, asked, "forces"), dtype=np.float64)
         if forces.shape != (len(asked), 3):
@@ -245,7 +243,7 @@ class CalculatorSubject:
         return self.energy(atoms), self.forces(atoms)
 
     def try_both(self, atoms: Atoms) -> Answered:
-        """Return energy and forces, or the calculator's error; in either case, save no structure."""
+        """Return energy and forces, or the calculator's error. Save no structure."""
         try:
             with self.trying():
                 return self.both(atoms)
@@ -258,7 +256,7 @@ class CalculatorSubject:
 
     @contextmanager
     def trying(self) -> Iterator[None]:
-        """Within this block, failures are expected: do not save structures on which the calculator fails."""
+        """Within this block, do not save structures on which the calculator fails."""
         before, self.saving = self.saving, False
         try:
             yield
@@ -266,10 +264,10 @@ class CalculatorSubject:
             self.saving = before
 
     def again(self, atoms: Atoms, energy: float | None = None, forces: Forces | None = None) -> bool:
-        """Evaluate a structure again with the same calculator object, and count any difference in `repeats`.
+        """Evaluate a structure again, and count any difference in `repeats`.
 
-        A difference counts as random only if the second result agrees with that of a new calculator object.
-        If the results of the two objects differ, earlier evaluations by the first object may be the reason.
+        A difference is random only if the second result agrees with a new calculator object. Otherwise,
+        earlier evaluations may be the reason.
 
         Args:
             energy: the earlier energy, eV; the energy or the forces are required.
@@ -313,7 +311,7 @@ class CalculatorSubject:
         return asked
 
     def _nearly(self, atoms: Atoms) -> bool:
-        """Return whether ASE would treat a structure as unchanged although bits of its data differ."""
+        """Return whether ASE treats a structure as unchanged although bits differ."""
         check = getattr(self.calculator, "check_state", None)
         if not callable(check):
             return False
@@ -408,7 +406,7 @@ def bits(atoms: Atoms) -> tuple[np.ndarray, ...]:
 
 
 def _question(atoms: Atoms) -> bytes:
-    """Return a hash of the complete calculator input: the structure, charges, tags and info."""
+    """Return a hash of the calculator's input: structure, charges, tags and info."""
     parts = {**atoms.arrays, "cell": np.asarray(atoms.cell), "pbc": atoms.pbc}
     info = {key: value for key, value in atoms.info.items() if isinstance(value, _PLAIN)}
     text = b"|".join(name.encode() + parts[name].tobytes() for name in sorted(parts))

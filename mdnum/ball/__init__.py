@@ -1,7 +1,6 @@
-"""The bouncing ball, a system with a known exact solution, for tests of events, stopping rules and precision.
+"""The bouncing ball, a system with an exact solution, to test events and precision.
 
-Names of this package are imported on first use, because most modules import jax, which is not needed to
-validate a system file.
+Names are imported on first use, because validation does not need jax.
 """
 
 # ruff: noqa: F401

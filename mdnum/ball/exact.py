@@ -1,18 +1,16 @@
-"""Closed-form motion of a bouncing ball, and the derivatives of this motion with respect to all parameters.
+"""Exact motion of a bouncing ball, and its derivatives with respect to all parameters.
 
-A ball starts at height y0 above the floor (at height 0) with velocity v0, under gravity g. The ball reaches
-the floor at t_1 = (v0 + s) / g with speed s = sqrt(v0² + 2 g y0). With the coefficient of restitution e,
-impact n has speed e^(n-1) s, and the time between impacts n and n + 1 is 2 e^n s / g. Therefore
+A ball starts at height y0 with velocity v0, under gravity g. It reaches the floor at t_1 = (v0 + s) / g with
+speed s = sqrt(v0² + 2 g y0). With restitution e, impact n has speed e^(n-1) s. The next impact is 2 e^n s / g
+later. Therefore
 
     t_n = t_1 + (2 s / g) (e + e² + ... + e^(n-1)),   t_rest = t_1 + (2 s / g) e / (1 - e).
 
 Infinitely many impacts take place before the finite time t_rest (Zeno behavior). With a spring and a damper,
-y'' = -g - k y - c y' below the floor, and each contact is a damped cosine. A simulation with penalty contacts
-discretizes the differential equation of spring and damper in time. A ball with a coefficient of restitution
-moves differently from a ball on a penalty contact, even in the limit of stiff springs, unless e = 1.
+y'' = -g - k y - c y' below the floor. A simulation with penalty contacts discretizes this equation in time.
+The limit of stiff springs differs from a ball with restitution, unless e = 1.
 
-All computations use numpy in float64. The exact solution shares no code with the simulations of this package,
-because it is their reference.
+All computations use numpy in float64. This reference shares no code with the simulations of this package.
 """
 
 from __future__ import annotations
@@ -35,7 +33,7 @@ _MOST = 100_000  # contacts after which something is wrong: each damped one take
 
 @dataclass(frozen=True)
 class Known:
-    """The exact value of a quantity, and its derivatives with respect to all parameters."""
+    """The exact value of a quantity, and its derivatives."""
 
     value: Float[np.ndarray, "..."]  # shape of what was asked for (times or impact numbers)
     # derivative by name of the parameter, each of that shape
@@ -46,7 +44,7 @@ Parameters = Mapping[str, complex]
 
 
 class _Motion:
-    """Base class of a ball's exact motions: checks initial values; computes height, velocity and derivatives.
+    """Base class of exact motions: height, velocity and derivatives of a ball.
 
     Complex-step derivatives have no cancellation (Squire & Trapp, SIAM Review 40 (1998) 110).
     """
@@ -80,7 +78,7 @@ class _Motion:
     def first_contact(self) -> Known:
         """Return the time (s) at which the ball first reaches the floor.
 
-        The error of the time is a few ulps for any sign of the initial velocity v0.
+        The error is a few ulps for any sign of v0.
         """
         return self._known(_down)[0]
 
@@ -93,19 +91,19 @@ class _Motion:
         return self.state(t)[0]
 
     def velocity(self, t: Times) -> Known:
-        """Return the velocity (m/s) at time t (s), or just after the impact if an impact is at time t."""
+        """Return the velocity (m/s) at time t (s). At an impact, it is the later velocity."""
         return self.state(t)[1]
 
 
 def _down(p: Parameters) -> tuple[complex, complex]:
-    """Return time (s) and speed (m/s) of the first contact, without cancellation for any initial velocity."""
+    """Return time (s) and speed (m/s) of the first contact, without cancellation."""
     y0, v0, g = p["y0"], p["v0"], p["gravity"]
     speed = np.sqrt(v0 * v0 + 2 * g * y0)
     return (v0 + speed) / g if v0.real >= 0 else 2 * y0 / (speed - v0), speed
 
 
 def _impact(p: Parameters, n: Any) -> tuple[Any, Any]:
-    """Return the time (s) of impact n and the speed (m/s) after this impact."""
+    """Return the time (s) of impact n, and the speed (m/s) after it."""
     first, speed = _down(p)
     e = p["restitution"]
     power, between = _powers(e, np.asarray(n, np.float64) - 1)
@@ -116,7 +114,7 @@ def _impact(p: Parameters, n: Any) -> tuple[Any, Any]:
 class ExactImpact(_Motion):
     """The exact motion of a ball that bounces with a coefficient of restitution.
 
-    Impacts are numbered from 1. At the time of an impact, height and velocity are those after the impact.
+    Impacts are numbered from 1. At an impact, height and velocity are those after it.
 
     Raises:
         InputError: a parameter is out of range, or the ball starts at rest on the floor.
@@ -148,7 +146,7 @@ class ExactImpact(_Motion):
         return self._known(lambda p: _impact(p, n))[0]
 
     def rest_time(self) -> Known:
-        """Return the time (s) at which the ball comes to rest after infinitely many impacts.
+        """Return the time (s) at which the ball comes to rest.
 
         Raises:
             InputError: the coefficient of restitution is 1.
@@ -167,7 +165,7 @@ class ExactImpact(_Motion):
         return self._known(at_rest)[0]
 
     def bounces(self, t: Times) -> Float[np.ndarray, "*times"]:
-        """Return the number of impacts up to and including time t (s), which is infinite at rest."""
+        """Return the number of impacts up to time t (s). It is infinite at rest."""
         t = _later(t)
         at = self._at
         first, speed = (part.real for part in _down(at))
@@ -191,7 +189,7 @@ class ExactImpact(_Motion):
         return np.where(finite & (np.real(_impact(at, now)[0]) > t) & (n > 1), n - 1, n)
 
     def state(self, t: Times) -> tuple[Known, Known]:
-        """Return height and velocity at time t (s); at rest, both and all their derivatives are zero."""
+        """Return height and velocity at time t (s). At rest, they are zero."""
         t = _later(t)
         n = self.bounces(t)
         still = np.isinf(n) | ((n > 0) & (self.restitution == 0))
@@ -210,12 +208,11 @@ class ExactImpact(_Motion):
 
 @dataclass(frozen=True)
 class ExactPenalty(_Motion):
-    """The exact motion of a ball on a penalty contact, with or without damping.
+    """The exact motion of a ball on a penalty contact.
 
-    The equation y'' = -g - k y - c y' holds as long as the ball is below the floor, so the damper may pull
-    the ball down at the end of a contact. Without damping, the end time of a contact has a closed form. With
-    damping, the end time is the root of the equation height = 0 between the lowest point and the next
-    maximum. A ball whose next maximum is below the floor comes to rest at depth g / k.
+    The equation y'' = -g - k y - c y' holds below the floor, so the damper may pull the ball down. Without
+    damping, the end time of a contact has a closed form. With damping, the end time is the root of height = 0
+    after the lowest point. A ball that cannot leave the floor comes to rest at depth g / k.
 
     Raises:
         InputError: a parameter is out of range, or the ball starts at rest on the floor.
@@ -241,14 +238,14 @@ class ExactPenalty(_Motion):
             )
 
     def state(self, t: Times) -> tuple[Known, Known]:
-        """Return height and velocity at time t (s); the height is negative during contact."""
+        """Return height and velocity at time t (s). The height is negative during contact."""
         t = _later(t)
         y, v = self._known(lambda p: _bounced(p, t))
         return y, v
 
 
 def _bounced(p: Parameters, t: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Compute height and velocity of a ball on a penalty contact, for complex parameters and real times."""
+    """Compute height and velocity on a penalty contact, for complex parameters."""
     y, v = np.zeros(t.shape, complex), np.zeros(t.shape, complex)
     g = p["gravity"]
     # where the current flight began, and how
@@ -280,7 +277,7 @@ def _bounced(p: Parameters, t: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _arc(p: Parameters, s: complex, tau):
-    """Return height and velocity at a time tau after the start of a contact with speed s."""
+    """Return height and velocity a time tau after a contact began with speed s."""
     k, half, deep = p["k"], p["damping"] / 2, p["gravity"] / p["k"]
     w = np.sqrt(k - half * half)
     fade, cosine, sine = np.exp(-half * tau), np.cos(w * tau), np.sin(w * tau) / w
@@ -292,7 +289,7 @@ def _arc(p: Parameters, s: complex, tau):
 
 
 def _end(p: Parameters, s: complex) -> complex | None:
-    """Return the duration (s) of a contact that begins with speed s, or None if the contact never ends."""
+    """Return the duration (s) of a contact that begins with speed s. None if it never ends."""
     half = p["damping"].real / 2
     if half * half > p["k"].real:
         return None
@@ -338,9 +335,9 @@ def _later(t: Times) -> Float[np.ndarray, "*times"]:
 
 
 def _powers(e: complex, n: Any) -> tuple[Any, Any]:
-    """Return e^n and 1 + e + ... + e^(n-1) for integers n, by repeated squaring and without cancellation.
+    """Return e^n and 1 + e + ... + e^(n-1) for integers n, without cancellation.
 
-    Near e = 1, the formula (1 - e^n) / (1 - e) and its derivative lose all digits by cancellation.
+    Near e = 1, the formula (1 - e^n) / (1 - e) loses all digits.
     """
     n = np.asarray(n, np.float64)
     power, total = np.ones(n.shape, complex), np.zeros(n.shape, complex)

@@ -1,4 +1,4 @@
-"""Model of the bouncing ball, in which decisions (contact, stop) can be recorded, replaced and imposed."""
+"""Model of the bouncing ball whose decisions can be recorded and imposed."""
 
 from __future__ import annotations
 
@@ -39,10 +39,10 @@ _MOST_ITERATIONS = 2**31 - 1  # iterations are counted in 32 bits
 
 
 class World(eqx.Module):
-    """Model of balls above a floor at height 0: all settings of a time step except the state.
+    """Model of balls above a floor at height 0, without their state.
 
     `World.create` checks all numbers and casts them to the dtypes in `policy`. Pass a `World` to jitted code
-    as an argument: if its zeros are constants, the compiler may remove operations with these zeros.
+    as an argument. Otherwise, the compiler may remove operations with zeros.
 
     Attributes:
         contact: contact model of the floor.
@@ -72,7 +72,7 @@ class World(eqx.Module):
         policy: RolePrecision | None = None,
         hysteresis: float | None = None,
     ) -> World:
-        """Create a bouncing-ball model: check all numbers, and cast them to the dtypes in `policy`.
+        """Create a model. Numbers are checked and cast to the dtypes of `policy`.
 
         Args:
             contact, integrator: contact model and integration scheme with plain numbers as parameters.
@@ -130,7 +130,7 @@ class World(eqx.Module):
         return attrgetter(self._known(name))(self)
 
     def with_values(self, values: Mapping[str, Any]) -> World:
-        """Return the model with other parameter values; values are not checked, so jax tracers are allowed.
+        """Return the model with other values. They are not checked, so jax tracers are allowed.
 
         Raises:
             InputError: the model has no such parameter.
@@ -146,7 +146,7 @@ class World(eqx.Module):
     # -- decide ----------------------------------------------------------------------------------------
 
     def touches(self, height: Balls, before: Bool[Array, "balls"]) -> Bool[Array, "balls"]:
-        """Return which balls touch the floor (height < 0); with `lift`, contact lasts until height > lift."""
+        """Return which balls touch the floor. With `lift`, contact lasts until height > lift."""
         height = height.astype(self.policy.dtype("decision"))
         enter = Threshold(jnp.zeros((), height.dtype), "<", "height")
         if self.lift is None:
@@ -168,7 +168,7 @@ class World(eqx.Module):
     def advance(
         self, state: BallState, *, imposed: BallDecisions | None = None, history: bool = False
     ) -> tuple[BallState, BallRecord]:
-        """Make one time step: decide which balls touch the floor, and compute heights and velocities.
+        """Make one time step: find contacts, then compute heights and velocities.
 
         Args:
             imposed: decisions that replace all or some of the model's own (see `BallDecisions`).
@@ -209,7 +209,7 @@ class World(eqx.Module):
         return lambda height: jnp.where(contact < 0, self.touches(height, state.touching), contact > 0)
 
     def free(self, step: Int[Array, ""], shape: tuple[int, ...]) -> Balls:
-        """Return the acceleration of each ball without contact (control minus gravity) in a step, m/s²."""
+        """Return the acceleration without contact (control minus gravity), m/s²."""
         free = -self.gravity
         if self.control is not None:
             # a control that ends before the run does stays at its last value
@@ -238,7 +238,7 @@ def _start(world: World, y: Array, v: Array) -> BallState:
 
 
 def _check(world: World) -> None:
-    """Raise an error if a number is out of range, or if contact and integration scheme are incompatible."""
+    """Raise an error if a number is out of range, or contact and scheme do not fit."""
     contact: Any = world.contact
     integrator: Any = world.integrator
     for name in world.parameters:
@@ -266,7 +266,7 @@ def _check(world: World) -> None:
 
 
 def _check_stop(rule: Any, policy: RolePrecision, gain: float) -> None:
-    """Raise an error if a stopping rule is invalid, or if its tolerance cannot be met in the given dtypes."""
+    """Raise an error if a stopping rule is invalid or cannot be met."""
     _count("max_iter", rule.max_iter)
     if isinstance(rule, stopping.FixedCount):
         return

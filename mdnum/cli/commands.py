@@ -94,7 +94,7 @@ def _top(
 
 
 class _Questions(TyperGroup):
-    """Group of subcommands; if the first argument is not a subcommand, the default subcommand is called."""
+    """Group of subcommands. Without the name of one, the default is called."""
 
     group: Mapping[str, Any]
 
@@ -143,7 +143,7 @@ def _of_verb(verb: str) -> Any:
 
 
 def _command(entry: str, name: str, said: Mapping[str, Any], shared: Mapping[str, Any]) -> Any:
-    """Create a command for the argument parser from the text file that describes an entry of `VERBS`."""
+    """Create a command for the parser from the text file of an entry of `VERBS`."""
     parts = [shared[one] for one in said.get("shares", ())]
     # a system comes first among arguments, and a command's own options before those of others
     arguments = {key: one for part in (*parts, said) for key, one in part.get("arguments", {}).items()}
@@ -174,7 +174,7 @@ def _made(name: str, said: Mapping[str, Any], function: Callable[..., Any], **se
 
 
 def _parameter(name: str, said: Mapping[str, Any], make: Callable[..., Any]) -> tuple[Any, Any]:
-    """Return the type and the default of an argument or option in the format of typer."""
+    """Return type and default of an argument or option for typer."""
     types = [_TYPES[word] for word in said.get("type", "text").split()]
     kind: Any = types[0] if len(types) == 1 else tuple[tuple(types)]
     kind = list[kind] if said.get("repeatable") else kind
@@ -200,7 +200,7 @@ def _flags(name: str, said: Mapping[str, Any]) -> list[str]:
 
 
 def _called(said: Mapping[str, Any], given: dict[str, Any], as_json: bool) -> int:
-    """Call the function of a command with command-line values, print the result, and return the exit code."""
+    """Call a command's function, print the result, and return the exit code."""
     typed = {**said["arguments"], **said["options"]}
     if given.get("resume") == given.get("out"):
         given.pop("out", None)
@@ -215,7 +215,7 @@ def _called(said: Mapping[str, Any], given: dict[str, Any], as_json: bool) -> in
     stopped = False
 
     def again() -> str | None:
-        """Return a sentence that tells the user how to continue a command that was stopped."""
+        """Return a sentence on how to continue a stopped command."""
         folder = given.get("resume") or progress.folder or given.get("out")
         with suppress(MdnumError):
             if "resume" in typed and folder is not None:
@@ -249,7 +249,7 @@ def _folder(path: Path) -> Any:
 
 
 def _options(said: Mapping[str, Any], given: Mapping[str, Any]) -> dict[str, Any]:
-    """Convert options to function arguments; permit execution of a Python file named on the command line."""
+    """Convert options to function arguments. A named Python file may be executed."""
     options = {}
     for name in given.keys() & said["options"].keys():
         off = said["options"][name].get("type") == "flag" and name.startswith("no_")

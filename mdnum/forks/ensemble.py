@@ -1,7 +1,7 @@
-"""Measure properties of runs with perturbed starts, and change programs to validate the statistical test.
+"""Measure properties of perturbed runs, and change programs to validate the test.
 
-Every property (feature) is a continuous function of the positions, so that a small difference between two
-runs changes the property only slightly. Pairs are therefore counted with hat functions and not in bins.
+Every property (feature) is a continuous function of the positions. Pairs are therefore counted with hat
+functions and not in bins.
 """
 
 from __future__ import annotations
@@ -42,9 +42,9 @@ _NUMBERS = (
 
 
 def nodes_of(simulation: Simulation, start: Start) -> Float[np.ndarray, "nodes"]:
-    """Return the peak positions of the hat functions of the pair histogram, then the histogram's upper end.
+    """Return the nodes of the pair histogram and its upper end.
 
-    The distances extend from the closest pairs of the initial state to the largest distance in the histogram.
+    They extend from the closest pairs to the largest distance.
     """
     simulation = simulation.in_row(start.state.cells[0])
     half = float(np.min(simulation.cell.widths)) / 2
@@ -55,16 +55,16 @@ def nodes_of(simulation: Simulation, start: Start) -> Float[np.ndarray, "nodes"]
 
 
 def feature_names(nodes: Float[np.ndarray, "nodes"]) -> tuple[str, ...]:
-    """Return the names of the features in the order of the values that `measure` returns."""
+    """Return the names of the features in the order of `measure`."""
     return (*_NUMBERS, *(f"pairs at distance {r:.3g}" for r in nodes[:-1]))
 
 
 def measure(
     simulation: Simulation, segment: Segment, nodes: Float[np.ndarray, "nodes"]
 ) -> Float[np.ndarray, "features"]:
-    """Compute the features at the last step of one segment of a run, in the internal units of the system.
+    """Compute the features at the last step of a segment, in internal units.
 
-    Energies, virial and forces are taken from the run; pairs are counted with a separate neighbor list.
+    Pairs are counted with a separate neighbor list.
     """
     potential, kinetic, virial = (
         float(segment.rows_of(name)[-1]) for name in ("potential", "kinetic", "virial")
@@ -93,7 +93,7 @@ def _forces(force, x, tables):
 def pair_distances(
     simulation: Simulation, x: Float[np.ndarray, "atoms 3"], reach: float
 ) -> Float[np.ndarray, "pairs"]:
-    """Return the distances (length) of all pairs of wrapped positions that are closer than `reach`."""
+    """Return the distances (lengths) of all pairs closer than `reach`. Positions must be wrapped."""
     table = VerletList(BUILDERS["host"], RebuildRule(0.0), reach).build(x, simulation.cell)
     slots, columns = np.nonzero(table.index < len(x))
     i, j = table.order[columns], table.order[table.index[slots, columns]]
@@ -105,10 +105,10 @@ def pair_distances(
 def hats(
     distances: Float[np.ndarray, "pairs"], nodes: Float[np.ndarray, "nodes"]
 ) -> Float[np.ndarray, "hats"]:
-    """Count pair distances with hat functions: each distance contributes to the two nearest nodes.
+    """Count pair distances with hat functions: each contributes to two nodes.
 
     The contribution to a node grows linearly as the distance approaches the node. A distance below the first
-    node is counted at this node. No count jumps when a distance passes the last node, which ends the range.
+    node is counted at this node. No count jumps when a distance passes the last node.
     """
     width = nodes[1] - nodes[0]
     place = np.clip((distances - nodes[0]) / width, 0.0, len(nodes) - 1.0)
@@ -122,19 +122,19 @@ def hats(
 
 
 def noise_size(simulation: Simulation) -> float:
-    """Return the displacement (length) of the atom that moves most when an initial state is perturbed."""
+    """Return the largest displacement (a length) of an atom in a perturbed state."""
     largest = np.abs(np.asarray(first_state(simulation).state.x)).max()
     return NOISE * float(np.spacing(np.float32(largest)))
 
 
 def starts(simulation: Simulation, count: int, seed: int, start: Start | None = None) -> list[Start]:
-    """Create the initial states of an ensemble: that of the simulation, with different noise for each run."""
+    """Create the initial states of an ensemble, with different noise for each run."""
     programs = MdProgram(simulation, start).nudged(noise_size(simulation), count, seed)
     return [program.start for program in programs]
 
 
 def stretches(simulation: Simulation, start: Start, steps: Iterable[int]) -> Iterator[Segment]:
-    """Run a simulation in segments that end at given steps, and yield each one; stop if the run blows up."""
+    """Run a simulation in segments and yield each one. Stop if it blows up."""
     for step in steps:
         for segment in Engine(simulation, step, start=start, record=False).segments():
             if segment.closes in FAILURES:
@@ -150,7 +150,7 @@ def ensemble(
     nodes: Float[np.ndarray, "nodes"],
     note: Callable[[], None] | None = None,
 ) -> Float[np.ndarray, "windows runs features"]:
-    """Measure the features of every run at every given step; NaN for steps after a run blew up.
+    """Measure the features of every run at given steps. NaN after a run blew up.
 
     Args:
         begin: a start for each run.
@@ -172,9 +172,9 @@ def ensemble(
 
 
 def steps_to_diverge(simulation: Simulation, start: Start | None, separation: float, seed: int) -> int | None:
-    """Return the step at which two runs of an ensemble have moved apart by a given distance.
+    """Return the step at which two runs have moved apart by a distance.
 
-    The result is None if the runs stay closer than the given distance for 20,000 steps, or if a run blows up.
+    The result is None if this takes over 20,000 steps, or if a run blows up.
     """
     steps = range(_EVERY, _LONGEST + 1, _EVERY)
     pair = [stretches(simulation, one, steps) for one in starts(simulation, 2, seed, start)]
@@ -191,7 +191,7 @@ def steps_to_diverge(simulation: Simulation, start: Start | None, separation: fl
 
 @dataclass(frozen=True)
 class Change:
-    """A program with a deliberate change, to test whether the comparison detects this change."""
+    """A program with a deliberate change, to validate the comparison."""
 
     name: str  # of the change, for readers
     must_fail: bool  # whether it is another model; else only other rounding
@@ -202,9 +202,8 @@ class Change:
 def planted(a: Simulation) -> tuple[Change, ...]:
     """Create the programs with deliberate changes that are possible for a simulation.
 
-    The test must detect programs with a longer time step or a shorter cutoff. Programs with forces in another
-    precision, with pairs in another order or with another neighbor search must pass the test. The cutoff and
-    the precision of a many-body potential cannot be changed, so these two changes are omitted for it.
+    The test must detect a longer time step and a shorter cutoff. It must accept another precision of forces,
+    order of pairs or neighbor search. For a many-body potential, cutoff and precision are not changed.
     """
     longer = eqx.tree_at(lambda one: one.timestep, a.integrator, a.integrator.timestep * _TIMESTEP)
     search = next(name for name in BUILDERS if name != a.builder)
@@ -220,7 +219,7 @@ def planted(a: Simulation) -> tuple[Change, ...]:
 
 
 def shorter(a: Simulation, factor: float) -> Simulation:
-    """Scale all cutoff radii of a simulation, and the radii at which switching functions begin."""
+    """Scale all cutoff radii, and the radii at which switching begins."""
 
     def ends(model):
         return jax.tree.leaves([(part.r_cut, part.r_onset) for part in model.parts])

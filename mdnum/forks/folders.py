@@ -1,10 +1,10 @@
-"""Find where two finished runs diverge, and how the runs differ, using only their folders.
+"""Find where two finished runs diverge, from their folders alone.
 
-The fork (first differing decision) and the first step at which any bit of the states differs are read from
-both folders; no run is repeated. To compare positions, `twin_of` rebuilds the programs, `fork` repeats runs.
+The first differing decision and the first differing bits are found. No run is repeated. To compare positions,
+`twin_of` rebuilds the programs, `fork` repeats runs.
 
-Runs cannot be compared if the atoms, box, potential or contact model of their systems differ. Runs may differ
-in any other parameter or numerical choice.
+Atoms, box, potential and contact model of both systems must agree. Runs may differ in any other parameter or
+numerical choice.
 """
 
 from __future__ import annotations
@@ -150,7 +150,7 @@ def twin_of(found: FolderFork, objects: Sequence[Simulation] = ()) -> Twin:
     """Rebuild the programs of two molecular-dynamics runs from their folders (`objects`: see
     `simulation_in`).
 
-    Repeated runs agree bit for bit with the stored runs if versions and processor are the same.
+    Repeated runs have the stored bits if versions and processor are the same.
     """
     difference = "; ".join(f"{key}: {one} and {other}" for key, one, other in found.differences[:3])
     a, b = alike(*(simulation_in(path, objects) for path in (found.a, found.b)))
@@ -194,7 +194,7 @@ def _compared(first: RunFolder, second: RunFolder, where: str) -> FolderFork:
 
 
 def _of_frames(first: RunFolder, second: RunFolder, where: str) -> FolderFork:
-    """Find the first step at which two trajectories, or two simulation loops, differ in a decision."""
+    """Find the first step at which two trajectories or loops differ in a decision."""
     summaries, names = (first.summary, second.summary), ("rule", "i", "j", "rank")
     rules, between = ([each[name] for each in summaries] for name in ("rules", "between"))
     names_of = [", ".join(one["rule"] for one in each) for each in rules]
@@ -225,8 +225,9 @@ def _of_frames(first: RunFolder, second: RunFolder, where: str) -> FolderFork:
 
 
 def choices(programs: list[Difference]) -> list[str]:
-    """Return the numerical choices in which two systems differ, given the keys whose values differ. All
-    dtypes together count as one numerical choice; so do a cutoff and its parameters.
+    """Return the choices in which two systems differ, given the differing keys.
+
+    All dtypes count as one choice, and so do a cutoff and its parameters.
     """
     keys = [key for key, _, _ in programs]
     out: dict[str, None] = {}
@@ -247,7 +248,7 @@ def _different(one: Mapping[str, Any], other: Mapping[str, Any]) -> list[Differe
 def _alone(
     first: RunFolder, second: RunFolder, table: str, labels: tuple[str, ...], steps: int, clock: str = "step"
 ) -> tuple[int | None, list[StoredFlip]]:
-    """Return the first step with a flip that only one of two tables contains, and the flips of this step."""
+    """Return the first step with flips in only one table, and these flips."""
     known = [folder.table(table, rows=1).column_names for folder in (first, second)]
     names = (clock, *labels, "entered", *["terms"] * all("terms" in one for one in known))
     further = ("distance", "ambiguous") if table == "flips" else ()
@@ -356,7 +357,7 @@ def _starts(first: RunFolder, second: RunFolder, programs: list[Difference], whe
 
 
 def _same_system(one: Any, other: Any) -> Iterator[tuple[bool, str]]:
-    """Compare two sets of atoms; for each property, yield whether it agrees, and a message if it does not."""
+    """Compare two sets of atoms. Yield for each property whether it agrees, and a message."""
     yield len(one) == len(other), f"numbers of atoms differ, {len(one)} and {len(other)}"
     symbols = [each.get_chemical_symbols() for each in (one, other)]
     yield symbols[0] == symbols[1], "species or their order differ"

@@ -1,4 +1,4 @@
-"""Parameters with respect to which a simulation can be differentiated, and the inputs that each one changes.
+"""Parameters of a simulation, and the inputs that each one changes.
 
 Names, values and units of parameters are those of `mdnum.systems.parameters`.
 """
@@ -49,7 +49,7 @@ class Cotangents:
 
 
 class Direction(NamedTuple):
-    """Derivatives of all inputs with respect to one parameter entry, or several (along the first axis)."""
+    """Derivatives of all inputs with respect to one or several parameter entries."""
 
     # x, v: of the positions and velocities of step 0, user's order
     x: Float[Array, "*columns 3 atoms"]
@@ -63,21 +63,21 @@ class Direction(NamedTuple):
 def quantities(force: PairForce | ManyBodyForce) -> Any:
     """Return the differentiable parameters of a force, as a pytree of arrays.
 
-    For a many-body potential, the pytree contains the potential's arrays and constants by name.
+    For a many-body potential, it contains arrays and constants by name.
     """
     return force.model if isinstance(force, PairForce) else manybody.quantities_of(force.potential)
 
 
 def with_quantities(force: PairForce | ManyBodyForce, values: Any) -> PairForce | ManyBodyForce:
-    """Return a copy of a force with other values of its parameters; can be called inside jit."""
+    """Return a copy of a force with other parameters. It can be called inside jit."""
     if isinstance(force, PairForce):
         return replace(force, model=values)
     return replace(force, potential=manybody.with_quantities(force.potential, values))
 
 
 def onto_start(simulation: Simulation, start: Any, extra: Any) -> tuple[Any, Array, Array]:
-    """Propagate derivatives of the loss backward to the integrator's parameters, positions and velocities,
-    from the extra state of step 0 (such as thermostat variables).
+    """Propagate derivatives from the extra state of step 0 (such as thermostat variables) to parameters,
+    positions and velocities.
 
     Args:
         start: the state of step 0.
@@ -92,7 +92,7 @@ def onto_start(simulation: Simulation, start: Any, extra: Any) -> tuple[Any, Arr
 
 
 def names(simulation: Simulation) -> tuple[str, ...]:
-    """Return the names of all parameters with respect to which a simulation can be differentiated."""
+    """Return the names of all parameters of a simulation."""
     # there is no derivative by a temperature of 0
     cold = () if value(simulation, "dynamics.temperature") else ("dynamics.temperature",)
     model = simulation.model
@@ -103,7 +103,7 @@ def names(simulation: Simulation) -> tuple[str, ...]:
 
 
 def resolve(simulation: Simulation, words: Sequence[str]) -> tuple[str, ...]:
-    """Return full names of parameters; a table name, such as "potential", stands for all its parameters.
+    """Return full names of parameters. "potential" stands for all of its parameters.
 
     Raises:
         InputError: a parameter does not exist, or is not a differentiable quantity.
@@ -127,7 +127,7 @@ def resolve(simulation: Simulation, words: Sequence[str]) -> tuple[str, ...]:
 
 
 def _places(simulation: Simulation, name: str) -> list[tuple[Callable[[Any], Any], Any]]:
-    """Return a selector function and the derivative of each input that depends on a parameter."""
+    """Return a selector and the derivative of each input that depends on a parameter."""
     if name in ("initial.positions", "initial.velocities"):
         return [((lambda of: of.x) if name == "initial.positions" else (lambda of: of.v), None)]
     v = simulation.velocities.T
@@ -151,7 +151,7 @@ def _places(simulation: Simulation, name: str) -> list[tuple[Callable[[Any], Any
 
 
 def gradient(simulation: Simulation, parts: Cotangents, name: str) -> Float[np.ndarray, "..."]:
-    """Return the derivative with respect to a named parameter, in the shape of the parameter's value."""
+    """Return the derivative with respect to a parameter, in its shape."""
     entry = parameters.entry(simulation, name)
     if name == "box.scale":
         return np.asarray(parts.scale)
@@ -170,7 +170,7 @@ def gradient(simulation: Simulation, parts: Cotangents, name: str) -> Float[np.n
 
 
 def moved(simulation: Simulation, still: Direction, column: ParameterEntry) -> Direction:
-    """Return derivatives of all inputs of a simulation with respect to one entry of a parameter."""
+    """Return derivatives of all inputs with respect to one parameter entry."""
     entry = parameters.entry(simulation, column.name)
     unit_entry = np.zeros(np.shape(value(simulation, entry.whole)))
     unit_entry[(*entry.index, *column.index)] = 1 / entry.factor
@@ -196,7 +196,7 @@ class ParameterEntry:
 
 
 def columns_of(simulation: Simulation, names: Sequence[str]) -> tuple[ParameterEntry, ...]:
-    """Return all entries (single numbers) of the given parameters, in the order of the parameters."""
+    """Return all entries (single numbers) of the given parameters."""
     return tuple(
         ParameterEntry(name, tuple(int(k) for k in index))
         for name in names
@@ -207,7 +207,7 @@ def columns_of(simulation: Simulation, names: Sequence[str]) -> tuple[ParameterE
 def gathered(
     simulation: Simulation, names: Sequence[str], values: Float[np.ndarray, "columns"]
 ) -> dict[str, Float[np.ndarray, "..."]]:
-    """Split a vector with one value per entry into arrays with the shapes of the parameters."""
+    """Split a vector of entries into arrays with the parameters' shapes."""
     shapes = {name: value(simulation, name).shape for name in names}
     ends = np.cumsum([int(np.prod(shape)) for shape in shapes.values()])
     parts = np.split(np.asarray(values, np.float64), ends[:-1])

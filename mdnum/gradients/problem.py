@@ -1,4 +1,4 @@
-"""Classes for gradients of a loss: problem to be differentiated, result, and base class of methods."""
+"""Gradients of a loss: the problem, the result, and the base class of methods."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ Values = Mapping[str, Any]
 
 @dataclass(frozen=True)
 class Problem:
-    """A differentiation problem: a simulation, a number of steps and a loss of the trajectory.
+    """A problem to differentiate: a simulation, a number of steps and a loss.
 
     Example:
         >>> loss = mdnum.gradients.losses.MeanPotential()
@@ -86,7 +86,7 @@ class Problem:
         return replace(self, simulation=parameters.with_values(self.simulation, values)) if values else self
 
     def value(self, values: Values | None = None) -> Any:
-        """Run the simulation and return its loss, a float (a complex number for a complex loss)."""
+        """Run the simulation and return its loss. It may be complex."""
         made = self.at(values or {})
         runs = (RunTape(one.simulation, one.loss, one.steps, budget=0) for one in made.parts or (made,))
         return sum(factor * run.value for factor, run in zip((1, 1j), runs, strict=False))
@@ -99,7 +99,7 @@ class Problem:
 
 @dataclass(frozen=True)
 class Gradient:
-    """Gradient of a loss, computed by one method, and a description of what this method computes.
+    """Gradient of a loss by one method, and what this method computes.
 
     Attributes:
         method: name of the method. description: one sentence on the derivative that the method computes.
@@ -122,9 +122,9 @@ class Gradient:
 
 
 class Method:
-    """Base class of gradient methods, which are frozen dataclasses of options, registered in METHODS.
+    """Base class of gradient methods. The registry is METHODS.
 
-    Gradient methods are subclasses of `Method` for molecular dynamics, and of `ball.BallMethod` for a ball.
+    Methods for a ball are subclasses of `ball.BallMethod`.
 
     Attributes:
         name: name on the command line. description: which derivative the method computes, one sentence.
@@ -136,11 +136,11 @@ class Method:
     kind: ClassVar[Kind] = "steps"
 
     def reason_unavailable(self, problem: Any, names: Sequence[str]) -> str | None:
-        """Return the reason why the method does not apply to a problem; None if the method applies."""
+        """Return why the method does not apply. None if it applies."""
         return None
 
     def __call__(self, problem: Any, names: Sequence[str], progress: Progress | None = None) -> Gradient:
-        """Compute the gradient; for a complex loss, apply the method to its real and imaginary parts in turn.
+        """Compute the gradient. A complex loss is treated in two parts.
 
         Raises:
             InputError: the method does not apply to this problem, or a parameter does not exist.
@@ -160,7 +160,7 @@ class Method:
         return parameters.resolve(problem.simulation, names)
 
     def check(self, problem: Any, names: Sequence[str]) -> tuple[str, ...]:
-        """Return the full names of parameters; raise an error if the method does not apply.
+        """Return full names of parameters. Raise an error if the method does not apply.
 
         Raises:
             InputError: a parameter does not exist, or the method does not apply.
@@ -209,7 +209,7 @@ def method(name: str) -> Method:
 
 
 def independent(problem: Problem, gradient: Mapping[str, Any], *, saltation: bool) -> dict[str, str]:
-    """For each parameter, return a note if its derivative is exactly zero or omits the effect of flips."""
+    """Return a note for derivatives that are exactly zero or omit flips."""
     notes = {}
     missing = problem.jumps and not saltation
     for name, value in gradient.items():
@@ -228,7 +228,7 @@ def independent(problem: Problem, gradient: Mapping[str, Any], *, saltation: boo
 
 
 def pairs_only(simulation: Simulation, *, any_step: bool = False) -> str | None:
-    """Return why a method for pair potentials does not apply; None if the method applies.
+    """Return why a method for pair potentials does not apply, or None.
 
     Args:
         any_step: whether every integrator is supported.
@@ -239,14 +239,14 @@ def pairs_only(simulation: Simulation, *, any_step: bool = False) -> str | None:
 
 
 def one_term(simulation: Simulation) -> str | None:
-    """Return why a method for a single pair potential does not apply; None if it applies."""
+    """Return why a method for one pair potential does not apply, or None."""
     if simulation.pairwise and "" not in simulation.model.terms:
         return f"it is for one pair potential, and {simulation.potential.name} are several terms"
     return pairs_only(simulation)
 
 
 def rounded(simulation: Simulation) -> str | None:
-    """Return why forces stored in fewer than 32 bits have no derivative; None for forces of 32 or 64 bits."""
+    """Return why forces of fewer than 32 bits have no derivative, or None."""
     if simulation.policy.dtype("force").itemsize < 4:
         precision = simulation.policy.force
         return f"forces in {precision} are rounded after every operation, which has no derivative"
@@ -254,7 +254,7 @@ def rounded(simulation: Simulation) -> str | None:
 
 
 def scalars_only(problem: Problem, names: Sequence[str]) -> str | None:
-    """Return why finite differences do not apply (a parameter has several entries); None if they apply."""
+    """Return why finite differences do not apply (an array parameter), or None."""
     large = [name for name in names if np.ndim(parameters.value(problem.simulation, name))]
     return f"{', '.join(large)}: a value for each shift of each entry would be needed" if large else None
 

@@ -1,7 +1,7 @@
 """Forward-mode derivatives: tangents of a few parameters along the recorded run.
 
-A tangent is propagated through each step at the recorded state and decisions. Each parameter entry requires
-one additional force evaluation per step, and no additional memory.
+A tangent is propagated through each step at the recorded state and decisions. Each parameter entry needs one
+more force evaluation per step, and no more memory.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ from mdnum.rollout.epoch import over_rows
 
 
 class TangentCarry(NamedTuple):
-    """Tangents of the state between two steps, one per parameter entry, with atoms in the user's order."""
+    """Tangents of the state between two steps, one per parameter entry, in the user's order."""
 
     # of the positions as if the box had no faces, at the step that comes next
     x: Float[Array, "columns 3 atoms"]
@@ -48,7 +48,7 @@ class TangentCarry(NamedTuple):
 
 @dataclass(frozen=True)
 class StretchTangents:
-    """Tangents along one stretch of a run: consecutive time steps with the same neighbor list."""
+    """Tangents along consecutive steps with the same neighbor list."""
 
     stretch: TapeStretch  # the steps
     columns: tuple[ParameterEntry, ...]  # the numbers by which it is differentiated
@@ -72,10 +72,10 @@ def tangents(
     states: bool = False,
     progress: Callable[[int, int], None] | None = None,
 ) -> Iterator[StretchTangents]:
-    """For each stretch of steps of a recorded run, yield the tangents with respect to named parameters.
+    """Yield tangents with respect to parameters for each stretch of steps.
 
-    If saltation is False, the tangents do not include the effect of flips. The contribution of flips is then
-    the sum of weight * (dr_cut - dr) over all crossings. Event-aware reverse mode provides the weights.
+    If saltation is False, the tangents do not include the effect of flips. The contribution of flips is the
+    sum of weight * (dr_cut - dr) over crossings. Event-aware reverse mode provides the weights.
 
     Args:
         tape: the run; recorded with flips if crossings are needed. names: full names of parameters.
@@ -117,7 +117,7 @@ def tangents(
 
 
 def by_column(tape: RunTape, total: Any) -> Float[np.ndarray, "columns"]:
-    """Compute the derivatives of the loss from the tangents of the frame sums in the loss."""
+    """Compute derivatives of the loss from the tangents of its frame sums."""
 
     def one(tangent):
         return jax.jvp(lambda total: tape.loss.value(total, tape.frames), (tape.total,), (tangent,))[1]
@@ -126,7 +126,7 @@ def by_column(tape: RunTape, total: Any) -> Float[np.ndarray, "columns"]:
 
 
 def _evaluate(force: PairForce | ManyBodyForce, x, tables: Tables, told, values, matrix) -> Forces:
-    """Evaluate forces with other parameters and lattice vectors, keeping the nearest image of each pair."""
+    """Evaluate forces with other parameters and box. Nearest images are kept."""
     other: Any = with_quantities(force, values)
     other = replace(other, cell=replace(force.cell, matrix=matrix))
     if isinstance(force, PairForce):
@@ -227,7 +227,7 @@ def _stretch(
 
 
 def _whole(matrix: Float[Array, "3 3"]) -> Float[Array, "3 3"]:
-    """Return the lattice vectors, with a unit vector in place of each zero vector."""
+    """Return the lattice vectors, with unit vectors in place of zeros."""
     missing = jnp.all(matrix == 0, axis=1)
     return jnp.where(missing[:, None], jnp.eye(3, dtype=matrix.dtype), matrix)
 

@@ -1,12 +1,11 @@
 """Constant pressure and temperature: the Martyna-Tobias-Klein barostat and stochastic cell rescaling.
 
 An isotropic barostat (`box = "isotropic"`) changes only the volume of the box. A full barostat ("full")
-changes all six parameters of the box, but does not rotate it. A strain or strain rate is stored as a number
-(a multiple of the unit matrix) or as a symmetric matrix. The pressure is (2 K + virial) / 3 V with the
-instantaneous kinetic energy K. The pressure tensor is Π / V with Π = Σ m v ⊗ v + Σ r ⊗ F. Volumes are sampled
-with the weight exp(-(U + p V) / k_B T) dV. Matrices h of full boxes have the measure dh / det(h)², where
-det(h) = V. If the total momentum is zero, the center of mass does not contribute to the pressure. The mean
-volume of an ideal gas is then N k_B T / p, otherwise (N + 1) k_B T / p.
+changes the box without rotating it. A strain or its rate is a number (isotropic) or a symmetric matrix. The
+pressure is (2 K + virial) / 3 V with the instantaneous kinetic energy K. The pressure tensor is Π / V with Π
+= Σ m v ⊗ v + Σ r ⊗ F. Volumes are sampled with the weight exp(-(U + p V) / k_B T) dV. Full boxes h have the
+measure dh / det(h)², where det(h) = V. At zero total momentum, the center of mass does not contribute. The
+mean volume of an ideal gas is then N k_B T / p.
 """
 
 from __future__ import annotations
@@ -32,9 +31,9 @@ _TERMS = 14
 
 
 def growth(a: Rate) -> Rate:
-    """Return (exp(a) - 1) / a = Σ aᵏ / (k + 1)! for a number or (3, 3) matrix a with norm up to 0.5.
+    """Return (exp(a) - 1) / a = Σ aᵏ / (k + 1)!, for a number or matrix with norm up to 0.5.
 
-    For matrices, the characteristic polynomial is used, which is differentiable even for equal eigenvalues.
+    Matrices use their characteristic polynomial, differentiable even for equal eigenvalues.
     """
     if a.ndim == 0:
         total = jnp.zeros(())
@@ -50,29 +49,29 @@ def growth(a: Rate) -> Rate:
 
 
 def invariants(a: Float[Array, "3 3"], square: Float[Array, "3 3"]) -> tuple[Number, Number, Number]:
-    """Return the coefficients of a³ = first a² - second a + third for a (3, 3) matrix a, given a and a²."""
+    """Return the coefficients of a³ = first a² - second a + third for a (3, 3) matrix."""
     first = jnp.trace(a)
     second = 0.5 * (first**2 - jnp.trace(square))
     return first, second, a[0] @ jnp.cross(a[1], a[2])
 
 
 def times(a: Rate, b: Rate) -> Rate:
-    """Return the product of two strain rates, given as two numbers or as two matrices."""
+    """Return the product of two strain rates, both numbers or both matrices."""
     return a @ b if a.ndim else a * b
 
 
 def exponential(a: Rate) -> Rate:
-    """Return exp(a) for a number or matrix a with norm up to 0.5; the result is exactly one if a is zero."""
+    """Return exp(a) for norms of a up to 0.5. It is exactly one for a = 0."""
     return unit(a) + times(a, growth(a))
 
 
 def unit(a: Rate) -> Rate:
-    """Return 1 if a strain rate is a number, or the unit matrix if the strain rate is a matrix."""
+    """Return 1, or the unit matrix if the strain rate is a matrix."""
     return jnp.eye(3) if a.ndim else jnp.ones(())
 
 
 def trace(a: Rate) -> Number:
-    """Return the trace of a strain rate; a number stands for a multiple of the (3, 3) unit matrix."""
+    """Return the trace. A number stands for a multiple of the unit matrix."""
     return jnp.trace(a) if a.ndim else 3 * a
 
 
@@ -82,7 +81,7 @@ def matrix(a: Rate) -> Float[Array, "3 3"]:
 
 
 def acted(x: Vector, a: Rate, *, fused: bool = False) -> Vector:
-    """Return the product of vectors (as rows) and a strain rate (number or matrix), in float64.
+    """Return the product of vectors (rows) and a strain rate, in float64.
 
     Args:
         fused: True to write the product as sums, which XLA fuses with other operations. Fusion is faster
@@ -130,14 +129,14 @@ class Barostat(Integrator):
             raise InputError(message, where="dynamics.kind", remedy="Use nose-hoover, csvr or langevin")
 
     def motion(self, v: Vector, masses: Masses) -> Rate:
-        """Return the kinetic tensor Σ m v ⊗ v (energy); for an isotropic box, a third of the trace."""
+        """Return Σ m v ⊗ v (an energy). For an isotropic box, a third of its trace."""
         if not self.anisotropic:
             return 2 * super().kinetic(v, masses) / 3
         v = v.astype(jnp.float64)
         return symmetric(products(v, masses * v))
 
     def excess(self, motion: Rate, at: AtStep) -> Rate:
-        """Return the tensor Π - p V at the target pressure p, or its diagonal's mean for an isotropic box."""
+        """Return Π - p V at the target pressure p. For an isotropic box, its mean diagonal."""
         virial = at.tensor if self.anisotropic else at.virial / 3
         assert virial is not None
         return motion + 0.5 * (virial + virial.T) - self.pressure * volume(at.cell) * unit(motion)
@@ -152,7 +151,7 @@ def volume(cell: Cell) -> Number:
 
 
 class BoxState(NamedTuple):
-    """Extra state of the integrator `MTK`: strain rate of the box, thermostat chains and initial volume."""
+    """Extra state of `MTK`: strain rate, thermostat chains and initial volume."""
 
     rate: Rate  # of the box, one over time
     atoms: Chain  # thermostats of the atoms
@@ -164,11 +163,10 @@ class MTK(Barostat):
     """Integrator for the isothermal-isobaric ensemble, deterministic and time-reversible.
 
     Martyna, Tobias, Klein, J. Chem. Phys. 101, 4177 (1994), with the operator splitting of Tuckerman et al.,
-    J. Phys. A 39, 5629 (2006), eq. 38 ff. A step applies the thermostat chains, the kick of the box by its
-    excess pressure, the kick of the atoms and the drift, and then the same operators in reverse order. The
-    inertia of the box is (N_f + 3) k_B T τ_p² (a third of this value for a full box). An isotropic box has
-    one degree of freedom, a full box six. If the box expands at a constant rate a, the drift over a time t is
-    exact: x(t) = x exp(a t) + v t exp(a t / 2) sinh(a t / 2) / (a t / 2).
+    J. Phys. A 39, 5629 (2006), eq. 38 ff. A step applies chains, kick of the box, kick of the atoms and
+    drift, then the same in reverse. The inertia of the box is (N_f + 3) k_B T τ_p², for a full box a third of
+    this. An isotropic box has one degree of freedom, a full box six. The drift is exact for a constant strain
+    rate a: x(t) = x exp(a t) + v t exp(a t / 2) sinh(a t / 2) / (a t / 2).
 
     Example:
         >>> mdnum.simulation(atoms, argon, cut, timestep=0.002, temperature=90, pressure=0.0,
@@ -198,7 +196,7 @@ class MTK(Barostat):
         return (self.freedom(masses) + 3) / share * self.kT * self.pressure_relaxation**2
 
     def _held(self, v, motion, extra, masses, time):
-        """Advance the separate thermostat chains of box and atoms; scale velocities and kinetic tensor."""
+        """Advance the thermostat chains of box and atoms. Scale velocities and kinetic tensor."""
         freedom, kT = self.freedom(masses), self.kT
         own, of_box = self._own(extra, masses)
         scale, atoms = extra.atoms.act(0.5 * trace(motion), freedom, kT, self.relaxation, time)
@@ -207,11 +205,11 @@ class MTK(Barostat):
         return v, motion * scale**2, extra._replace(rate=extra.rate * slowed, atoms=atoms, chain=chain)
 
     def _own(self, extra, masses):
-        """Return the kinetic energy of the box, and its number of degrees of freedom."""
+        """Return kinetic energy and degrees of freedom of the box."""
         return 0.5 * self.inertia(masses) * jnp.sum(jnp.square(extra.rate)), 6 if self.anisotropic else 1
 
     def _pushed(self, motion, extra, at, time):
-        """Return the state after excess pressure and kinetic energy acted on the box for a given time."""
+        """Return the state after pressure and kinetic energy acted on the box."""
         heat = trace(motion) / self.freedom(at.masses)
         push = self.excess(motion, at) + heat * unit(extra.rate)
         # of an isotropic box the three directions together
@@ -219,7 +217,7 @@ class MTK(Barostat):
         return extra._replace(rate=extra.rate + time * share * push / self.inertia(at.masses))
 
     def _kicked(self, v, extra, at, time):
-        """Return velocities after the forces and the strain rate have acted for a given time."""
+        """Return velocities after the forces and the strain rate have acted."""
         rate = extra.rate
         slow = -time * (rate + trace(rate) / self.freedom(at.masses) * unit(rate))
         kick = acted(at.acceleration, time * growth(slow), fused=True)
@@ -255,7 +253,7 @@ class MTK(Barostat):
 
 
 class Move(NamedTuple):
-    """Extra state of `CellRescaling`: the last change of the box and the work done on the atoms."""
+    """Extra state of `CellRescaling`: the last box change and the work."""
 
     strain: Rate  # logarithm of the deformation
     # root: of the volume before; step: of that root; force: on it, and excess: along the other directions,
@@ -270,13 +268,12 @@ class Move(NamedTuple):
 class CellRescaling(Barostat):
     """Integrator for the isothermal-isobaric ensemble: first-order stochastic cell rescaling with CSVR.
 
-    In the middle of the drift, the square root of the volume is propagated by an Euler step with the present
-    forces. The noise added to the square root of the volume does not depend on the volume. Velocities are
-    scaled inversely to the box (Bernetti, Bussi, J. Chem. Phys. 153, 114107, 2020, section II C). In a full
-    box, an Euler step also propagates the traceless strain (del Tatto, Raiteri, Bernetti, Bussi, Applied
-    Sciences 12, 1139, 2022). The noise of the strain is computed from the geometric mean of the volumes
-    before and after the step. The probabilities of each step and of its reverse give an effective energy, the
-    total energy minus heat and work. The effective energy is conserved within the time-step error.
+    In the middle of the drift, an Euler step changes the square root of the volume. Its noise does not depend
+    on the volume. Velocities are scaled inversely (Bernetti, Bussi, J. Chem. Phys. 153, 114107, 2020, section
+    II C). In a full box, the traceless strain is changed, too (del Tatto, Raiteri, Bernetti, Bussi, Applied
+    Sciences 12, 1139, 2022). Its noise uses the geometric mean of old and new volume. Step probabilities give
+    an effective energy, the total energy minus heat and work. The effective energy is conserved within the
+    time-step error.
 
     Example:
         >>> mdnum.simulation(atoms, argon, cut, timestep=0.002, temperature=90, pressure=0.0,
@@ -307,17 +304,16 @@ class CellRescaling(Barostat):
         return self.compressibility / (4 * self.pressure_relaxation)
 
     def _forces(self, v, at):
-        """Return √V, the force on √V, and the traceless part of the excess pressure tensor (see `excess`).
+        """Return √V, its force, and the traceless excess pressure tensor.
 
-        The force on √V is k_B T d ln P / d√V, where P ~ √V exp(-(U + K + p V) / k_B T) is the probability
-        density of √V.
+        The force is k_B T d ln P / d√V for the probability density P ~ √V exp(-(U + K + p V) / k_B T).
         """
         root, excess = jnp.sqrt(volume(at.cell)), self.excess(self.motion(v, at.masses), at)
         part = trace(excess) / 3
         return root, (2 * part + self.kT) / root, excess - part * unit(excess)
 
     def _shear(self, root, after):
-        """Return the mobility of a traceless strain, a symmetric function of √V before and after the step."""
+        """Return the mobility of a traceless strain, symmetric in both √V."""
         return 4 / 3 * self._mobility / (root * after)
 
     def finish(self, v, extra, at, time):

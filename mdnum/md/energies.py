@@ -1,8 +1,8 @@
-"""Call user-defined energy functions over a neighbor list in a uniform way, whatever their arguments are.
+"""Call energy functions with neighbor lists, whatever their arguments are.
 
-Functions written for jax-md differ in the order of the arguments, the form of the box, the kind of positions
-(real or fractional), the format of neighbor lists, and the return value. The signature determines the order
-of the arguments. All other properties are determined by trial calls (`mdnum.systems.admission`).
+Functions for jax-md differ in arguments, box, positions (real or fractional), neighbor lists and return
+value. The signature determines the order of the arguments. All other properties are determined by trial calls
+(`mdnum.systems.admission`).
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ ENERGIES: Mapping[str, float] = {
 
 @dataclass(frozen=True)
 class Convention:
-    """Calling convention of an energy function; the fields after `keywords` are determined by trial calls."""
+    """Calling convention of an energy function. Trial calls set the fields after `keywords`."""
 
     native: bool = False  # (parameters, positions, neighbor, cell)
     parameters: bool = False  # they come first
@@ -78,7 +78,7 @@ class Call:
     name: str = "energy function"
 
     def bare(self, parameters: Any, x: Array, neighbor: Any, given: Mapping[str, Array]) -> Any:
-        """Return the energy in the function's own units, or its unchanged result if `returns` is empty.
+        """Return the energy in the function's own units.
 
         Args:
             given: the keywords of the convention; for mdnum's own convention, "cell".
@@ -140,7 +140,7 @@ def _real_slope_jvp(primals, tangents):
 
 
 class EnergyFunction(ManyBody):
-    """Potential from an energy function over a jax-md neighbor list; its parameters can be any pytree.
+    """Potential from an energy function over a jax-md neighbor list.
 
     Attributes:
         parameters: a pytree of arrays; the name of each parameter is its path, `potential.parameters...`.
@@ -176,7 +176,7 @@ class EnergyFunction(ManyBody):
 
     @property
     def fixed_box(self) -> bool:
-        """True if the box of the function was fixed when the function was created."""
+        """True if the box was fixed when the function was created."""
         return any(self.pbc) and not self.call.how.box
 
     def energy(self, positions, neighbor, cell):
@@ -197,14 +197,14 @@ def energy_function(
     name: str = "",
     compare: str = "r <",
 ) -> EnergyFunction:
-    """Make a potential from an energy function over a neighbor list, with any jax-md convention.
+    """Make a potential from an energy function over a neighbor list.
 
-    Supported forms are `energy_fn(R, neighbor, **kw)`, `energy_fn(params, R, neighbor, **kw)`, `energy_fn(R,
-    *, box=, neighbor=, perturbation=)`, and mdnum's own form `f(parameters, positions, neighbor, cell)`. A
-    function may be given alone, or with its neighbor functions as returned by jax-md's `*_neighbor_list`. The
-    function may use neighbor lists with several images. The energy function returns a number, a number per
-    atom, or a dictionary with key "total" or "energy". Box vectors in rows or columns, and real or fractional
-    positions, are distinguished by trial calls when a simulation is made.
+    Supported forms are `energy_fn(R, neighbor, **kw)`, `energy_fn(params, R, neighbor, **kw)`,
+    `energy_fn(R, *, box=, neighbor=, perturbation=)`, and mdnum's own form
+    `f(parameters, positions, neighbor, cell)`. The function is given alone or with jax-md's neighbor
+    functions. The function may use neighbor lists with several images. It returns a number, a number per
+    atom, or a dictionary with key "total" or "energy". Trial calls find out the form of box vectors and
+    positions.
 
     Example:
         >>> made = jax_md.energy.lennard_jones_neighbor_list(displacement, box)

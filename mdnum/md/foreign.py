@@ -1,4 +1,4 @@
-"""XLA callbacks on a CPU: numba functions that read XLA's call frames (xla/ffi/api/c_api.h, version 0.3)."""
+"""XLA callbacks on a CPU: numba functions for XLA's call frames (xla/ffi/api/c_api.h, version 0.3)."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ VERSION = (0, 3)
 
 @cache
 def known() -> bool:
-    """Return True if XLA's callback interface has the supported version, and programs run on a CPU."""
+    """Return True if the callback interface is supported, and programs run on a CPU."""
     header = Path(jax.ffi.include_dir()) / "xla" / "ffi" / "api" / "c_api.h"
     text = header.read_text() if header.exists() else ""
     found = [re.search(rf"#define XLA_FFI_API_{part} (\d+)", text) for part in ("MAJOR", "MINOR")]
@@ -36,7 +36,7 @@ ALIVE: list[Any] = []
 
 
 def registered(name: str, function: Any, *held: Any) -> str:
-    """Register a C function with XLA on the CPU, keep its data alive, and return its name."""
+    """Register a C function with XLA on the CPU, and return its name."""
     ALIVE.extend([function, *held])
     jax.ffi.register_ffi_target(name, jax.ffi.pycapsule(function), platform="cpu")
     return name
@@ -57,7 +57,7 @@ def pointer(typingctx: Any, address: Any) -> Any:
 
 @intrinsic
 def call(typingctx: Any, address: Any, arguments: Any) -> Any:
-    """Call the C function at an address with a tuple of 64-bit arguments, and return its result."""
+    """Call the C function at an address with 64-bit arguments. Return its result."""
 
     def generate(context: Any, builder: Any, signature: Any, args: Any) -> Any:
         whole = context.get_value_type(types.intp)
@@ -70,7 +70,7 @@ def call(typingctx: Any, address: Any, arguments: Any) -> Any:
 
 @intrinsic
 def added(typingctx: Any, address: Any, amount: Any) -> Any:
-    """Atomically add to the 64-bit number at an address, and return the previous number."""
+    """Atomically add to the 64-bit number at an address. Return its previous value."""
 
     def generate(context: Any, builder: Any, signature: Any, args: Any) -> Any:
         at = builder.inttoptr(args[0], context.get_value_type(types.intp).as_pointer())
@@ -112,7 +112,7 @@ def poke(typingctx: Any, address: Any, k: Any, value: Any) -> Any:
 
 @intrinsic
 def buffer(typingctx: Any, buffers: Any, k: Any) -> Any:
-    """Return the address of the data of the k-th operand or result, and its first two dimensions."""
+    """Return the address and the first two dimensions of operand or result k."""
     made = types.UniTuple(types.intp, 3)
 
     def generate(context: Any, builder: Any, signature: Any, args: Any) -> Any:

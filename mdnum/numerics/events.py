@@ -1,4 +1,4 @@
-"""Decisions (comparisons of a quantity with a threshold), and the table of all changes of decisions."""
+"""Decisions that compare a quantity with a threshold, and tables of their changes."""
 
 from __future__ import annotations
 
@@ -15,10 +15,10 @@ INCLUSIVE = {"<": False, "<=": True}
 
 @dataclass(frozen=True)
 class Threshold:
-    """A threshold with which a computed quantity is compared, together with the comparison operator.
+    """A threshold and the operator that compares a quantity with it.
 
-    The comparison is part of the physical model. Two programs that compare r by `<` and by `<=`, or that
-    compare r and r², can differ for pairs of atoms exactly at the cutoff.
+    The comparison is part of the physical model. Programs that compare r or r², by `<` or `<=`, can differ
+    for pairs exactly at the cutoff.
     """
 
     # the threshold in the quantity's own space, exactly as the program compares it: a number, or an array
@@ -32,25 +32,25 @@ class Threshold:
             raise InputError(f"comparison = {self.comparison!r}; expected one of {', '.join(INCLUSIVE)}")
 
     def margin(self, quantity):
-        """Return the threshold minus the compared quantity, which is positive if the decision is "yes".
+        """Return threshold minus quantity. It is positive if the decision is "yes".
 
-        The margin is exact if the quantity is within a factor of 2 of the threshold (Sterbenz lemma). The
-        sign is always correct, because an IEEE difference of unequal numbers is never zero.
+        The margin is exact within a factor of 2 of the threshold (Sterbenz lemma). The sign is always
+        correct, as unequal numbers never give zero.
         """
         return self.value - quantity
 
     def decide(self, quantity):
-        """Return whether the comparison of a quantity with the threshold is true; False for NaN."""
+        """Return whether the comparison is true. False for NaN."""
         return quantity <= self.value if INCLUSIVE[self.comparison] else quantity < self.value
 
 
 @dataclass(frozen=True)
 class Hysteresis:
-    """A decision with hysteresis (a Schmitt trigger), which turns on at one threshold and off at another.
+    """A decision with hysteresis: two thresholds turn it on and off.
 
-    With one threshold, a quantity that fluctuates about the threshold flips the decision at each crossing. If
-    the two thresholds differ by more than the fluctuation, the decision flips only once. Similarly, a Verlet
-    list with a skin is rebuilt only when the skin is used up, not at every move.
+    With one threshold, a fluctuating quantity flips the decision at each crossing. With two distant
+    thresholds, the decision flips only once. Similarly, a Verlet list is rebuilt only when its skin is used
+    up.
     """
 
     enter: Threshold  # where a no turns yes
@@ -72,7 +72,7 @@ class Hysteresis:
             )
 
     def margin(self, quantity, before):
-        """Return a quantity's signed distance to the current threshold, positive if the decision is "yes".
+        """Return the distance to the current threshold, positive if the decision is "yes".
 
         Args:
             quantity: computed value(s).
@@ -96,9 +96,9 @@ def _where(condition, yes, no):
 
 @dataclass(frozen=True)
 class Ledger:
-    """Table of all flips of one kind of decision, sorted by time step and then by labels of atoms or balls.
+    """Table of all flips of one kind of decision, sorted by step and labels.
 
-    A flip at step s means that the decision at s differs from the decision at s - 1.
+    At a flip, the decision differs from that of the previous step.
 
     Attributes:
         channel: name of the stream of decisions, for example "pair".
@@ -125,16 +125,16 @@ class Ledger:
 
     @property
     def ambiguous(self) -> Bool[np.ndarray, "flips"]:
-        """Whether rounding errors could change the step of each flip: |margin| is within the error bound."""
+        """Whether each |margin| is within the error bound, so that rounding could move the flip."""
         return np.abs(self.margin) <= self.bound
 
     def counts(self, steps: int) -> tuple[Int[np.ndarray, "steps"], Int[np.ndarray, "steps"]]:
-        """Return, for each step from 0 to `steps`, how many decisions changed to yes and how many to no."""
+        """Return the numbers of changes to yes and to no at each step."""
         entered = np.bincount(self.step[self.entered], minlength=steps + 1)
         left = np.bincount(self.step[~self.entered], minlength=steps + 1)
         return entered, left
 
     def jumps(self, steps: int) -> Float[np.ndarray, "steps"]:
-        """Return the sum of the energy jumps of all flips, for each step from 0 to `steps`."""
+        """Return the sum of the energy jumps at each step."""
         # bincount of nothing is a row of integers, whatever its weights
         return np.bincount(self.step, weights=self.jump, minlength=steps + 1).astype(np.float64)

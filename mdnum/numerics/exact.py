@@ -1,10 +1,9 @@
 """Floating-point arithmetic inside jit whose results have the same bits on every processor.
 
-XLA on a CPU contracts a*b + c into a fused multiply-add. With fused operations, the bits of an expression
-depend on the instruction set, and differ from those of numpy. The decision whether a pair is inside the
-cutoff must not depend on the compiler. The function `fence` prevents fused multiply-add, so numpy reproduces
-cutoff decisions bit for bit. Formulas can also be evaluated operation by operation: with every result
-rounded, in interval arithmetic, or with the same bits on every processor.
+XLA on a CPU contracts a*b + c into a fused multiply-add. With fused operations, bits depend on the processor
+and differ from numpy. A cutoff decision must not depend on the compiler. `fence` prevents fused multiply-add,
+so numpy reproduces the decisions. Formulas can also be rounded at every operation, or evaluated in interval
+arithmetic.
 """
 
 from __future__ import annotations
@@ -24,12 +23,12 @@ from mdnum.numerics import elementary
 
 
 def integer_of(dtype):
-    """Return the signed integer type with the same number of bits as a float dtype."""
+    """Return the signed integer type with the width of a float dtype."""
     return jnp.dtype(f"int{8 * np.dtype(dtype).itemsize}")
 
 
 def zero_bits(dtype) -> jax.Array:
-    """Return an integer zero with the width of dtype, to be passed into jit for use by `fence`."""
+    """Return an integer zero with the width of dtype, for `fence`."""
     return jax.device_put(np.zeros((), integer_of(dtype)))
 
 
@@ -40,10 +39,10 @@ def _through_integers(x, zero):
 
 @jax.custom_jvp
 def fence(x: jax.Array, zero: jax.Array) -> jax.Array:
-    """Return x, and prevent XLA from contracting the operation that computes x with the next operation.
+    """Return x. XLA cannot fuse the operations before and after.
 
-    The fence is an exclusive-or of the bits of x with a zero whose value XLA does not know when it compiles.
-    The fence also forces rounding to float16 and bfloat16, which XLA on a CPU may omit.
+    The bits of x are combined (exclusive-or) with a zero unknown to XLA. This also forces rounding to float16
+    and bfloat16 on a CPU.
 
     XLA's optimization_barrier and reduce_precision do not prevent contraction (openxla/xla#41579).
     """
@@ -57,9 +56,9 @@ def _fence_jvp(primals, tangents):
 
 
 def squared_norm(dx: jax.Array, dy: jax.Array, dz: jax.Array, zero: jax.Array) -> jax.Array:
-    """Return dx² + dy² + dz² with the same bits as in numpy, because every operation is rounded.
+    """Return dx² + dy² + dz² with the same bits as numpy.
 
-    The error of r² is at most gamma_3 r² for exact dx, dy, dz; gamma_n = n u / (1 - n u) (Higham 2002, 3.1).
+    The relative error of r² is at most 3 u / (1 - 3 u) for exact dx, dy, dz (Higham 2002, 3.1).
     """
     return (fence(dx * dx, zero) + fence(dy * dy, zero)) + fence(dz * dz, zero)
 
@@ -67,9 +66,8 @@ def squared_norm(dx: jax.Array, dy: jax.Array, dz: jax.Array, zero: jax.Array) -
 def root(x: jax.Array) -> jax.Array:
     """Return the square root, correctly rounded on every device.
 
-    On an H200 GPU, XLA's float32 square root has an error of one ulp for one number in six. A float64 square
-    root, rounded to float32, is correctly rounded, because 53 >= 2 * 24 + 2 (Figueroa 1995, "When is double
-    rounding innocuous?").
+    On an H200 GPU, one float32 square root in six is wrong by one ulp. A float64 square root, rounded to
+    float32, is correct (Figueroa 1995, "When is double rounding innocuous?").
     """
     if x.dtype != jnp.float32 or jax.default_backend() == "cpu":
         return jnp.sqrt(x)
@@ -96,7 +94,7 @@ def stepwise(
     enter: Callable[[Any], Any] = _same,
     leave: Callable[[Any], jax.Array] = _same,
 ) -> Callable[..., Any]:
-    """Return a version of an array function in which a given rule computes the result of each operation.
+    """Return a function in which a rule computes the result of each operation.
 
     Args:
         function: function of arrays, which may close over other arrays.
@@ -119,7 +117,7 @@ def stepwise(
 def interpreted(
     program: Any, arguments: Sequence[Any], rule: Rule, enter: Callable[[Any], Any] = _same
 ) -> list[Any]:
-    """Run a jaxpr with a rule that computes each operation (see `stepwise`), and return the results."""
+    """Run a jaxpr with a rule for each operation, and return the results."""
     jaxpr, constants = (program.jaxpr, program.consts) if isinstance(program, ClosedJaxpr) else (program, ())
     known = dict(zip(jaxpr.constvars, map(enter, constants), strict=True))
     known.update(zip(jaxpr.invars, map(enter, arguments), strict=True))
@@ -139,7 +137,7 @@ def interpreted(
 
 
 def inlined(equation: Any) -> Any:
-    """Return the jaxpr that an operation calls once (such as a function with custom derivatives), or None."""
+    """Return the jaxpr that an operation calls once, or None."""
     programs = (equation.params.get(key) for key in ("jaxpr", "call_jaxpr", "fun_jaxpr"))
     return next(filter(None, programs), None) if equation.primitive.name in _CALLED else None
 
@@ -157,12 +155,12 @@ def bound(equation: Any, inputs: Sequence[Any]) -> list[jax.Array]:
 
 
 def rounded(function: Callable[..., Any], zero: jax.Array) -> Callable[..., Any]:
-    """Return a version of a function that rounds the result of every 16-bit floating-point operation.
+    """Return a function that rounds the result of every 16-bit operation.
 
-    XLA on a CPU computes float16 and bfloat16 expressions in float32, and may omit the rounding between two
-    operations. In the returned function, a fence after each operation forces the rounding. For + - * / and
-    sqrt, the results have the same bits as numpy with ml_dtypes. The functions exp and cos are computed in
-    float32 and may differ between libraries. Results that are not 16-bit floats do not change.
+    On a CPU, XLA computes 16-bit expressions in float32, and may omit roundings. In the returned function, a
+    fence after each operation forces the rounding. For + - * / and sqrt, the bits are those of numpy with
+    ml_dtypes. exp and cos are computed in float32 and may differ between libraries. Results that are not
+    16-bit floats do not change.
 
     Args:
         function: function of arrays; it may close over others.
@@ -181,10 +179,10 @@ def _is_short(dtype: Any) -> bool:
 
 
 def enclosed(function: Callable[..., Any], arguments: int) -> Callable[..., list[Any]]:
-    """Return a version of a float64 function in interval arithmetic; each interval contains the exact value.
+    """Return a float64 function in interval arithmetic. Intervals contain the exact value.
 
-    Constants of the formula are treated as exact float64 numbers. If both branches of a `where` are possible
-    within an interval, the result is the union of the intervals of both branches.
+    Constants of the formula are treated as exact float64 numbers. If both branches of a `where` are possible,
+    the result covers both.
 
     Args:
         function: function of scalars; jax traces it once.
@@ -294,7 +292,7 @@ _FAR = (
 
 
 def normal_quantile(u: jax.Array, zero: jax.Array) -> jax.Array:
-    """Return sqrt(2) erf⁻¹(u) in float64, a standard normal deviate if u is uniform between -1 and 1.
+    """Return sqrt(2) erf⁻¹(u), a normal deviate for uniform u between -1 and 1.
 
     The relative error of the result is about 1e-15.
     """
@@ -322,7 +320,7 @@ _SAFE = (
 
 @dataclass
 class _Held:
-    """A number in a jaxpr that is being interpreted, with flags that tell whether a fence is needed."""
+    """A number in an interpreted jaxpr, with flags for fences."""
 
     value: Any
     safe: bool = True
@@ -331,7 +329,7 @@ class _Held:
 
 
 def reproducible(function: Callable[..., Any], zero: jax.Array) -> Callable[..., Any]:
-    """Return a version of a float64 function whose results do not depend on how the function is compiled.
+    """Return a float64 function whose results do not depend on compilation.
 
     Args:
         function: function of arrays; it may close over others.

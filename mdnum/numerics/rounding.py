@@ -90,7 +90,7 @@ class Reach:
         return sizes, most
 
     def narrowed(self, dtype: DTypeLike) -> Float[np.ndarray, "3"]:
-        """Return, for each axis, the summed error (a length) of rounding all lattice vectors to a dtype."""
+        """Return, by axis, the error (a length) of rounding lattice vectors to a dtype."""
         lattice = np.array(self.lattice, np.float64).reshape(-1, 3)
         return np.abs(lattice.astype(dtype).astype(np.float64) - lattice).sum(axis=0)
 
@@ -103,13 +103,12 @@ def _three(values) -> Vector:
 def displacement_bound(
     r, reach: Reach, dtype: DTypeLike = np.float64, state: DTypeLike = np.float64, seen=None
 ):
-    """Return a bound on the error (length of the error vector) of a computed displacement.
+    """Return a bound on the error (a length) of a computed displacement.
 
-    Each rounded result adds at most the unit roundoff times its magnitude to the error. If the dtype of the
-    state has more digits than `dtype`, the positions of both atoms are first rounded. If float64 has more
-    digits than `dtype`, the lattice vectors of the box are also rounded. The exact displacement is defined by
-    the positions of the state and the box of the system file. The nearest image found in `dtype` must be the
-    true nearest image. Therefore, r_cut must be below half the box width by more than the rounding error.
+    Each rounding adds at most the unit roundoff times its result. If `dtype` has fewer digits than the state,
+    positions are first rounded. If `dtype` has fewer digits than float64, lattice vectors are rounded, too.
+    The exact displacement follows from the state and the system file. The nearest image found in `dtype`
+    must be the true nearest image. Therefore, half the box width must exceed r_cut by more than the error.
 
     Args:
         r: length(s) of the displacement.
@@ -134,7 +133,7 @@ def displacement_bound(
 def squared_distance_bound(
     r, reach: Reach, dtype: DTypeLike = np.float64, state: DTypeLike = np.float64, seen=None
 ):
-    """Return a bound on |computed r² - exact r²|, from the errors of displacement, squares and sums.
+    """Return a bound on |computed r² - exact r²|.
 
     Args: as `displacement_bound`.
 
@@ -147,10 +146,10 @@ def squared_distance_bound(
 
 
 def distance_bound(r, reach: Reach, dtype: DTypeLike = np.float64, state: DTypeLike = np.float64, seen=None):
-    """Return a bound on |computed r - exact r|, where r is the correctly rounded square root of r².
+    """Return a bound on |computed r - exact r| for a correctly rounded square root.
 
-    The error of the length of a vector is at most the length of the error vector. The square root halves the
-    relative error of r² and adds one rounding.
+    A length changes by at most the length of the error vector. The square root halves the relative error of
+    r² and adds one rounding.
 
     Args: as `displacement_bound`.
 

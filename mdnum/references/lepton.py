@@ -1,7 +1,7 @@
-"""LAMMPS as a reference for pair functions, by means of its pair style `lepton`.
+"""LAMMPS as a reference for pair functions, by its pair style `lepton`.
 
-The function traced by jax is translated to an expression, which LAMMPS parses and differentiates. Pairs,
-sums, energies and derivatives are thus computed by an independent program.
+LAMMPS parses and differentiates an expression made from the function. Pairs, sums, energies and derivatives
+are thus computed by an independent program.
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ _LARGEST = 100_000
 
 
 class Untranslated(Exception):
-    """Raised for an operation that lepton does not support; the message names this operation."""
+    """Raised for an operation that lepton does not support."""
 
 
 def installed() -> bool:
@@ -95,7 +95,7 @@ def expression(function: Any) -> str:
 
 
 def expressions(simulation: Simulation) -> list[str]:
-    """Return the energy of a user's pair function with cutoff as lepton expressions, one for each pair type.
+    """Return a pair function's energy as lepton expressions, one per pair type.
 
     Raises:
         Untranslated: the model is not a single pair function, or lepton does not support it.
@@ -119,7 +119,7 @@ def expressions(simulation: Simulation) -> list[str]:
 
 
 class Lepton(ClassicalCalculator):
-    """ASE calculator that evaluates a pair function with LAMMPS, in a new process for each call.
+    """ASE calculator that evaluates a pair function in a new LAMMPS process.
 
     Args:
         simulation: a simulation with a user's pair function.
@@ -176,7 +176,7 @@ class Lepton(ClassicalCalculator):
 
 
 def _ran(script: str, data: str) -> tuple[np.ndarray, np.ndarray]:
-    """Run LAMMPS; return the total energy, the pressure components, and a table with one row per atom."""
+    """Run LAMMPS. Return energy, pressure components, and a table of atoms."""
     with TemporaryDirectory() as place:
         folder = Path(place)
         (folder / "in.data").write_text(data)

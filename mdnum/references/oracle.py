@@ -1,4 +1,4 @@
-"""Find the pairs inside a cutoff by brute force, with exact arithmetic near the cutoff."""
+"""Find the pairs inside a cutoff by brute force and exact arithmetic."""
 
 from __future__ import annotations
 
@@ -49,11 +49,11 @@ def widths(cell: Vectors) -> Float[ndarray, "3"]:
 def rounding_bound(
     positions: Positions, cell: Vectors, r_cut: float, *, unit_roundoff: float = 2.0**-53
 ) -> float:
-    """Upper bound on the rounding error (length) of a computed distance that is close to r_cut.
+    """Upper bound on the rounding error (a length) of a distance close to r_cut.
 
-    The bound is valid for a code that wraps coordinates, adds a lattice vector, subtracts and takes the norm.
-    Numbers in this code are at most as large as the coordinates plus the cell, and each operation rounds once
-    or twice. Typical rounding errors are a tenth of this bound.
+    It applies to codes that wrap coordinates, add a lattice vector, subtract and take the norm. Numbers are
+    at most coordinates plus cell. Each operation rounds once or twice. Typical rounding errors are a tenth of
+    this bound.
 
     Args:
         positions: coordinates as passed to the code.
@@ -69,9 +69,9 @@ def rounding_bound(
 def exactly_inside(
     positions: Positions, cell: Vectors, i: int, j: int, shift: Shift, r_cut: float, *, closed: bool = False
 ) -> bool:
-    """Decide in exact arithmetic whether a pair is inside r_cut; if `closed`, r == r_cut counts as inside.
+    """Decide exactly whether a pair is inside r_cut. If `closed`, r == r_cut is inside.
 
-    In exact arithmetic, r < r_cut and r² < r_cut² are equivalent; with rounding, they may differ.
+    With rounding, r < r_cut and r² < r_cut² may differ.
     """
     squared, threshold = Fraction(0), Fraction(float(r_cut)) ** 2
     for axis in range(3):
@@ -91,12 +91,11 @@ def all_pairs(
     closed: bool = False,
     reach: float | None = None,
 ) -> PairSet:
-    """Find every pair within `reach` by brute force, and decide exactly whether it is inside r_cut.
+    """Find every pair within `reach`. Decide exactly whether it is inside r_cut.
 
-    All pairs are tested with every lattice vector that could bring the atoms together, without cell list or
-    skin. The result is therefore valid for triclinic cells, periodicity along some axes, atoms outside the
-    cell, and cells smaller than the cutoff (a pair then appears once per image). The computing time is
-    proportional to the square of the number of atoms, by design.
+    All pairs and all relevant lattice vectors are tested, without cell list or skin. Triclinic cells, partial
+    periodicity, atoms outside the cell, and small cells are allowed. A small cell has several images of a
+    pair. The time is proportional to the square of the number of atoms.
 
     Args:
         positions: coordinates, wrapped or not.
@@ -131,7 +130,7 @@ def all_pairs(
 
 
 def _usable_cell(cell: ndarray, pbc: ndarray) -> ndarray:
-    """Check that every periodic direction has a cell vector, and return the completed cell."""
+    """Check the vectors of periodic directions, and return the completed cell."""
     lengths = np.linalg.norm(cell, axis=1)
     for axis in np.flatnonzero(pbc):
         if not lengths[axis] > 0.0:
@@ -144,7 +143,7 @@ def _usable_cell(cell: ndarray, pbc: ndarray) -> ndarray:
 
 
 def completed(cell: Vectors, pbc: Axes) -> Vectors:
-    """Return the cell with each nonperiodic vector replaced by a unit vector normal to the other vectors."""
+    """Return the cell with unit vectors, normal to the others, as nonperiodic vectors."""
     if pbc.all():
         return cell
     free = np.flatnonzero(~pbc)
@@ -155,7 +154,7 @@ def completed(cell: Vectors, pbc: Axes) -> Vectors:
 
 
 def _within(positions: ndarray, cell: ndarray, pbc: ndarray, reach: float):
-    """Yield (i, j, shift, distance) of the pairs within `reach`, one block of pairs at a time."""
+    """Yield (i, j, shift, distance) of the pairs within `reach`, block by block."""
     n, stored, width = len(positions), np.where(pbc[:, None], cell, 0.0), widths(cell)
     fractional = np.linalg.solve(cell.T, positions.T).T
     # |normal component| <= reach, so when reach is under half a width the image in reach can only be

@@ -1,8 +1,7 @@
-"""Exact time reversal of a run with a fixed-point (integer) state, from the last step to the first.
+"""Exact time reversal of a run with an integer state.
 
-Every step is reversed by subtracting the integers that the step added to the state. All states of the forward
-run are therefore recovered bit for bit. The reversed run can use other neighbor lists than the forward run,
-because sums of integers do not depend on the order of pairs.
+A step is reversed by subtracting the integers that it added. All states of the forward run are therefore
+recovered bit for bit. The neighbor lists may differ, because integer sums do not depend on order.
 """
 
 from __future__ import annotations
@@ -39,7 +38,7 @@ class Back(NamedTuple):
 
 
 class Stretched(NamedTuple):
-    """Steps that time reversal has recorded, earliest first; atoms are in the order of the neighbor list."""
+    """Steps of a reversed run, earliest first, in the order of the neighbor list."""
 
     first: int  # step of the first row
     rows: int  # how many there are; the record's other rows are void
@@ -59,7 +58,7 @@ def _undrifted(leaves, structure, state: EpochState) -> Back:
 
 
 def _before(program: EpochProgram, masses, order, back: Back) -> Back:
-    """Reverse an update of positions (a drift), and return the state of the previous step."""
+    """Reverse an update of positions (a drift). Return the previous state."""
     step = back.step - 1
     x, v, extra = program.integrator.undrift(  # type: ignore[attr-defined]
         back.x, back.v, back.extra, masses, step, order
@@ -71,7 +70,7 @@ def _before(program: EpochProgram, masses, order, back: Back) -> Back:
 
 @partial(jax.jit, static_argnames=("structure",), donate_argnames=("record",))
 def _run_back(leaves, structure, tables: Tables, back: Back, record: EpochRecord):
-    """Reverse steps until a new neighbor list or stored velocity bits are needed, or the record is full."""
+    """Reverse steps until a new neighbor list or stored bits are needed."""
     program: EpochProgram = jax.tree.unflatten(structure, leaves)
     order = tables.order
 
@@ -177,7 +176,7 @@ class BackwardRun:
         self._check_bath()
 
     def _change_bath(self) -> None:
-        """Restore the thermostat's bath (velocity bits removed by friction) at steps that emptied it."""
+        """Restore the thermostat's bath (bits removed by friction) at steps that emptied it."""
         step, period = int(self.back.step), self.simulation.propagator.pause
         if period is None or step % int(period):
             return
@@ -187,7 +186,7 @@ class BackwardRun:
         self.back = self.back._replace(extra=ByAtom(jnp.asarray(self.baths[step])))
 
     def _check_bath(self) -> None:
-        """Raise `NumericalError` if the thermostat's bath is not zero at the step that emptied it."""
+        """Raise `NumericalError` if the bath is not zero at the step that emptied it."""
         if any(np.any(np.asarray(part)) for part in jax.tree.leaves(self.back.extra)):
             step = max(int(self.back.step), 0)
             raise NumericalError(

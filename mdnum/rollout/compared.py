@@ -1,4 +1,4 @@
-"""Comparison of two runs whose atom labels and axes may differ (permutation, symmetry operation, shift)."""
+"""Comparison of two runs whose atom labels or axes may differ."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from mdnum.md.neighbors import PairTable
 
 @dataclass(frozen=True)
 class ReferenceFrame:
-    """Mapping of the atom labels and axes of one run to those of another run."""
+    """Mapping of labels and axes of one run to those of another."""
 
     labels: Int[np.ndarray, "atoms"]  # atom b of this run is atom labels[b] of the other, shape (atoms,)
     axes: Int[np.ndarray, "3"]  # axis a of the other run is axis axes[a] of this one, shape (3,)
@@ -42,7 +42,7 @@ class ReferenceFrame:
 
     @property
     def inverse(self) -> ReferenceFrame:
-        """Inverse mapping: from the labels and axes of the other run to those of this run."""
+        """Inverse mapping, from the other run to this run."""
         shift = -self.signs * self.shift[self.axes]
         axes = np.argsort(self.axes)
         return ReferenceFrame(np.argsort(self.labels), axes, self.signs[axes], shift)
@@ -50,7 +50,7 @@ class ReferenceFrame:
     def positions(
         self, x: Float[np.ndarray, "rows 3 atoms"], by: Float[np.ndarray, "rows 3 3"] | None = None
     ) -> Float[np.ndarray, "rows 3 atoms"]:
-        """Convert positions to the labels and axes of the other run, without wrapping into the box.
+        """Convert positions to the other run's labels and axes, without wrapping.
 
         Args:
             by: deformation of the box since the start for each row; None if the box is fixed.
@@ -86,11 +86,11 @@ class ReferenceFrame:
         return out
 
     def keys(self, own: Int[np.ndarray, "pairs"]) -> Int[np.ndarray, "pairs"]:
-        """Convert integer keys of pairs to the atom labels of the other run, and sort the keys."""
+        """Convert keys of pairs to the other run's labels, sorted."""
         return np.sort(self.keys_of(*np.divmod(own, len(self.labels))))
 
     def keys_of(self, i: Int[np.ndarray, "pairs"], j: Int[np.ndarray, "pairs"]) -> Int[np.ndarray, "pairs"]:
-        """Return integer keys of pairs of atoms i and j, with the atom labels of the other run."""
+        """Return keys of pairs i, j in the other run's labels."""
         atoms = len(self.labels)
         channel, i = np.divmod(i, atoms)
         a, b = self.labels[i], self.labels[j]
@@ -102,7 +102,7 @@ class ReferenceFrame:
 
 @dataclass(frozen=True)
 class CrossFlip:
-    """Pair of atoms whose cutoff decision starts or stops differing between two runs at a time step."""
+    """Pair whose decision starts or stops differing between two runs."""
 
     step: int  # of the flip
     # i, j: the pair, labels of the first run, i < j
@@ -118,7 +118,7 @@ class CrossFlip:
 
 @dataclass(frozen=True)
 class PairFlips(Columns):
-    """Flips in one of two runs, stored as columns; pairs are named by the atom labels of the first run."""
+    """Flips in one of two runs, as columns, with the labels of the first run."""
 
     step: Int[np.ndarray, "flips"]  # of the flip
     key: Int[np.ndarray, "flips"]  # i * atoms + j of the pair, i < j
@@ -130,7 +130,7 @@ class PairFlips(Columns):
 
 @dataclass(frozen=True)
 class CrossFlips(Sequence[CrossFlip]):
-    """Sequence of `CrossFlip`s, sorted by step and stored as arrays because there may be millions."""
+    """Sequence of `CrossFlip`s, sorted by step and stored as arrays."""
 
     flips: PairFlips  # of either run
     from_b: Bool[np.ndarray, "flips"]  # which of them are the second run's
@@ -165,7 +165,7 @@ class CrossFlips(Sequence[CrossFlip]):
 
 
 class CrossRecorder:
-    """Record of the pairs of atoms that are inside the cutoff in only one of two runs.
+    """Record of the pairs that are inside the cutoff in only one run.
 
     Args:
         a, b: keys of the pairs inside the cutoff at the first step, with labels of the first run.
@@ -177,7 +177,7 @@ class CrossRecorder:
         self.differing: Int[np.ndarray, "pairs"] = np.setxor1d(a, b, assume_unique=True)
 
     def opening(self) -> list[CrossFlip]:
-        """Return the pairs whose decisions differ between the two runs at step 0, as `CrossFlip` objects."""
+        """Return the pairs whose decisions differ at step 0."""
         i, j = np.divmod(self.differing, self.atoms)
         pairs = zip(i.tolist(), j.tolist(), strict=True)
         return [CrossFlip(0, i, j, True, "B", False, np.nan, np.nan) for i, j in pairs]
@@ -185,7 +185,7 @@ class CrossRecorder:
     def take(
         self, first: int, rows: int, a: PairFlips, b: PairFlips
     ) -> tuple[Int[np.ndarray, "rows"], CrossFlips]:
-        """Return, for each step, the number of pairs with different decisions; also return the `CrossFlips`.
+        """Return the number of differing pairs by step, and the `CrossFlips`.
 
         Args:
             first: step of the first row.
@@ -211,7 +211,7 @@ class CrossRecorder:
 
 
 def _times_before(keys: Int[np.ndarray, "n"]) -> Int[np.ndarray, "n"]:
-    """Return, for each integer in an array, how often the same integer occurs before it."""
+    """Return how often each integer occurs earlier in the array."""
     order, times = np.argsort(keys, kind="stable"), np.empty(len(keys), np.int64)
     times[order] = np.arange(len(keys)) - np.searchsorted(keys[order], keys[order])
     return times
@@ -231,7 +231,7 @@ def _place(values, order, out):
 def in_user_order(
     values: Float[np.ndarray, "rows 3 atoms"], order: Int[np.ndarray, "atoms"]
 ) -> Float[np.ndarray, "rows 3 atoms"]:
-    """Return vectors of atoms, such as positions, in the user's order of atoms and in float64.
+    """Return vectors of atoms, such as positions, in the user's order.
 
     Args:
         order: atom k of the record is atom order[k].
@@ -296,7 +296,7 @@ def separations(
     b: Float[np.ndarray, "rows 3 atoms"],
     others: Sequence[Cell] = (),
 ) -> Float[np.ndarray, "rows"]:
-    """Return, for each step, the largest distance between an atom's positions in two runs (or NaN).
+    """Return the largest distance between positions in two runs by step (or NaN).
 
     Args:
         cells: the box, or one box for each row; distances are minimum-image distances.
@@ -312,7 +312,7 @@ def separations(
 
 
 def strains(cells: Sequence[Cell], others: Sequence[Cell]) -> Float[np.ndarray, "rows"]:
-    """Return the strain (largest relative change of any length) between two boxes at each step."""
+    """Return the strain between two boxes, the largest relative change of length, by step."""
     by = np.array([cell.deformation(other) for cell, other in zip(cells, others, strict=True)])
     out, known = np.full(len(by), np.nan), np.flatnonzero(np.isfinite(by).all(axis=(1, 2)))
     # a rotation is no strain
@@ -329,7 +329,7 @@ def overridden(
     species: Int[np.ndarray, "atoms"],
     r_cut: Float[np.ndarray, "channels species species"],
 ) -> tuple[Int[np.ndarray, "rows"], Float[np.ndarray, "rows"]]:
-    """Return the number of atom pairs with different decisions, and the largest |r - r_cut| of these pairs.
+    """Return the number of differing pairs, and their largest |r - r_cut|.
 
     Args:
         cells: as for `separations`.
@@ -347,5 +347,5 @@ def overridden(
 def differ(
     a: Float[np.ndarray, "rows 3 atoms"], b: Float[np.ndarray, "rows 3 atoms"]
 ) -> Bool[np.ndarray, "rows"]:
-    """Return True for each step at which any number differs between two runs or is NaN."""
+    """Return True for each step at which numbers differ or are NaN."""
     return (a != b).any(axis=(1, 2))

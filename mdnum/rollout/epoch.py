@@ -1,4 +1,4 @@
-"""The compiled loop over time steps with one neighbor list (an epoch): state, records, imposed decisions."""
+"""The compiled loop over time steps with one neighbor list (an epoch)."""
 
 from __future__ import annotations
 
@@ -35,23 +35,23 @@ class Pin:
     inside: bool = False  # what it is told before the first of them
 
     def at(self, steps: Int[np.ndarray, "steps"]) -> Bool[np.ndarray, "steps"]:
-        """Return the imposed decision at each of the given steps, where True means inside the cutoff."""
+        """Return the imposed decision at each step. True means inside the cutoff."""
         turned = np.searchsorted(np.asarray(self.changes, np.int64), steps, side="right")
         return (turned % 2 == 1) ^ self.inside
 
 
 @dataclass(frozen=True)
 class Pins:
-    """Cutoff decisions that are imposed on selected pairs of atoms; the run makes all other decisions."""
+    """Cutoff decisions that are imposed on selected pairs of atoms."""
 
     pins: Sequence[Pin]
 
     def rows(
         self, table: PairTable, first: int, count: int, channels: int = 1
     ) -> tuple[UInt8[np.ndarray, "rows words atoms"], UInt8[np.ndarray, "rows words atoms"]]:
-        """Return the decisions imposed at consecutive steps as packed bits, with a mask of imposed entries.
+        """Return imposed decisions at consecutive steps as bits, with a mask.
 
-        No decision can be imposed on a pair of atoms that is too distant to be in the neighbor list.
+        Pairs outside the neighbor list can have no imposed decision.
 
         Args:
             table: the neighbor list.
@@ -103,7 +103,7 @@ class EpochProgram(eqx.Module):
 
 
 class EpochState(NamedTuple):
-    """State of a run between two force evaluations, in the user's order of atoms."""
+    """State of a run between two force evaluations, in the user's order."""
 
     step: Int[Array, ""]  # the step whose forces come next
     x: Float[Array, "3 atoms"]  # wrapped positions at that step, shape (3, atoms)
@@ -118,7 +118,7 @@ class EpochState(NamedTuple):
 
 
 class StepInputs(NamedTuple):
-    """Inputs of a time step that its derivatives need, in addition to positions, box and virial."""
+    """Inputs of a time step that only its derivatives need."""
 
     v: Float[Array, "3 atoms"]  # velocities that lead there, as the step before left them
     extra: Any  # the extra state then
@@ -127,7 +127,7 @@ class StepInputs(NamedTuple):
 
 
 class EpochRecord(NamedTuple):
-    """Record with one row per time step; atoms are in the order of the neighbor list."""
+    """Record with one row per time step, in the order of the neighbor list."""
 
     # x, v: positions and full-step velocities, shape (rows, 3, atoms), or (rows, 3, 0) without rows
     x: Float[Array, "rows 3 atoms"]
@@ -149,7 +149,7 @@ class EpochRecord(NamedTuple):
     inputs: Any = ()  # `StepInputs` of each row, where they were asked for
 
     def boxes(self, rows: int, pbc: tuple[bool, bool, bool]) -> tuple[Cell, ...]:
-        """Return the simulation boxes of the first steps; the result is empty if the box is constant."""
+        """Return the boxes of the first steps. Empty if the box is constant."""
         if not self.cell.size:
             return ()
         return tuple(Cell.create(one, pbc) for one in np.asarray(self.cell)[:rows])
@@ -188,7 +188,7 @@ def empty_record(
     cells: bool = False,
     inputs: Any = (),
 ) -> EpochRecord:
-    """Allocate the record of an epoch; arrays with one entry per atom are empty if `record` is False.
+    """Allocate the record of an epoch. Without `record`, arrays of atoms are empty.
 
     Args:
         changes: number of changes of decisions to allocate in place of rows of decisions and positions.
@@ -210,7 +210,7 @@ def empty_record(
 
 
 def write_row(record: EpochRecord, row, **values) -> EpochRecord:
-    """Write the values of one time step into the named arrays of a record."""
+    """Write the values of one time step into a record."""
 
     def put(column, value):
         return lax.dynamic_update_index_in_dim(column, jnp.asarray(value, column.dtype), row, 0)
@@ -222,11 +222,10 @@ def write_row(record: EpochRecord, row, **values) -> EpochRecord:
 def over_rows(
     step: Callable[[Any, Any], tuple[Any, Any]], carry: Any, rows: Any, used: Any, *, backward: bool = False
 ) -> tuple[Any, Any]:
-    """Scan like `jax.lax.scan` over the first `used` rows, in reverse order if `backward` is True.
+    """Scan like `jax.lax.scan`, but only over the first `used` rows.
 
-    Buffers have the size of the longest segment of steps, so that one compiled function can be used for all
-    segments. A loop over the whole buffer would spend most of its time on empty rows. Outputs for unused rows
-    of the buffers are zero.
+    Buffers have the size of the longest segment, to compile one function. A loop over the whole buffer would
+    mostly visit empty rows. Outputs for unused rows of the buffers are zero.
     """
     first = jax.tree.map(lambda leaf: jax.ShapeDtypeStruct(leaf.shape[1:], leaf.dtype), rows)
     _, out = jax.eval_shape(step, carry, first)
@@ -262,7 +261,7 @@ def run_epoch(
     pinned: UInt8[Array, "rows words atoms"] | None = None,
     held: UInt8[Array, "words atoms"] | None = None,
 ) -> tuple[EpochOutcome, EpochRecord]:
-    """Integrate with one neighbor list until its skin is used up, the record is full or the run ends.
+    """Integrate until the skin is used up, the record is full or the run ends.
 
     Args:
         leaves, structure: the program, flattened by jax.tree.flatten.

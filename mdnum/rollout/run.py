@@ -1,4 +1,4 @@
-"""Simulation runs that write a run folder, check their results, and can be resumed after they are killed."""
+"""Simulation runs that write a run folder and can be resumed."""
 
 from __future__ import annotations
 
@@ -69,7 +69,7 @@ class RunResult:
 
 @dataclass
 class _Progress:
-    """Counts and sums from the start of a run to the current step, which are stored in checkpoints."""
+    """Counts and sums of a run up to the current step, for checkpoints."""
 
     tally: RunTally
     health: ListHealth
@@ -131,7 +131,7 @@ class Rollout:
         self.recorder = PairRecorder(self.simulation, saved.get("held"))
 
     def run(self) -> dict[str, Any]:
-        """Run to the last step, write all files except the report page, and return the summary.
+        """Run to the last step, write all files, and return the summary. No report is made.
 
         Raises:
             NumericalError: a number is no longer finite; all results up to the previous step are kept.
@@ -186,7 +186,7 @@ class Rollout:
             self.shown(here, np.asarray(positions, np.float64))
 
     def _needs_rows(self) -> bool:
-        """True if time steps are read so often that storing them is faster than recomputing them."""
+        """True if storing time steps is faster than recomputing them."""
         simulation = self.simulation
         policy = simulation.policy
         # in single precision most steps have a margin within its bound, and a bad list misses pairs
@@ -352,7 +352,7 @@ def run(
     progress: Progress | None = None,
     shown: Shown | None = None,
 ) -> RunResult:
-    """Simulate a system, and record every pair that crosses the cutoff in a run folder.
+    """Simulate a system, and record every pair that crosses the cutoff.
 
     Args:
         system: a simulation, a system, a shipped name or the path of a system file; None when resuming,
@@ -414,7 +414,7 @@ def _fresh(simulation: Simulation, layout: Layout, out, steps, save_every, progr
 
 
 def _finished(path: Path, steps: int | None, given: Simulation | None) -> RunResult | None:
-    """Return the result in a folder if the run in this folder is complete, else None."""
+    """Return the result in a folder if its run is complete, else None."""
     folder = RunFolder.open(path)
     summary = folder.summary
     if summary.get("status") != "complete" or not folder.has_checkpoint():

@@ -1,4 +1,4 @@
-"""Steps and flips of one run, converted to the atom labels and axes of another run."""
+"""Steps and flips of a run, in the labels and axes of another run."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from mdnum.systems.simulation import Simulation
 
 @dataclass(frozen=True)
 class Rows:
-    """Consecutive time steps of a run, with the atom labels and axes of the first run in a comparison."""
+    """Consecutive time steps of a run, in the labels of the first run."""
 
     first: int  # step of the first row
     # x, v: wrapped positions and full-step velocities, shape (rows, 3, atoms), float64
@@ -58,7 +58,7 @@ class Rows:
         return replace(self, x=x, v=v, cells=frame.boxes(self.cells, self.box))
 
     def cut(self, count: int) -> tuple[Rows, Rows]:
-        """Split a group of time steps into the first `count` steps and the remaining steps."""
+        """Split time steps into the first `count` steps and the rest."""
 
         def part(rows: slice, **changed: Any) -> Rows:
             columns = {name: getattr(self, name) for name in _COLUMNS}
@@ -86,7 +86,7 @@ _COLUMNS = ("x", "v", "energy", "nearest", "overridden", "furthest")
 
 
 def taken(ahead: list[Rows], last: int) -> Rows | None:
-    """Remove the time steps up to a given step from a list and return them; None if there are none."""
+    """Remove and return the time steps up to a step. None if there are none."""
     parts: list[Rows] = []
     while ahead and ahead[0].first <= last:
         rows = ahead.pop(0)
@@ -98,7 +98,7 @@ def taken(ahead: list[Rows], last: int) -> Rows | None:
 
 
 class Track:
-    """Reader of a run, which returns time steps and flips in the order of time.
+    """Reader that returns the time steps and flips of a run in order.
 
     Args:
         simulation: the run.
@@ -135,7 +135,7 @@ class Track:
         self.failed = ""
 
     def segment(self) -> Segment | None:
-        """Read and store the next group of time steps of the run; return None at the end of the run."""
+        """Read the next time steps of the run. None at its end."""
         segment = next(self._segments, None)
         if segment is None:
             return None
@@ -158,7 +158,7 @@ class Track:
         return self._ahead[-1].last
 
     def until(self, last: int) -> Rows | None:
-        """Return the time steps up to `last` that have not been returned yet, or None if there are none."""
+        """Return further time steps up to `last`. None if there are none."""
         while not self._ahead or self.ready < last:
             if self.segment() is None:
                 break
@@ -171,7 +171,7 @@ class Track:
         return every[every.step <= last]
 
     def doubts(self, last: int) -> AmbiguousPairs:
-        """Return the ambiguous decisions up to step `last` that have not been returned yet."""
+        """Return further ambiguous decisions up to step `last`."""
         every = AmbiguousPairs.concatenate(self._doubts)
         taken = every[every.step <= last]
         self._doubts = [every[every.step > last]]
@@ -180,7 +180,7 @@ class Track:
 
 
 def rows_of(simulation: Simulation, segment: Segment, frame: ReferenceFrame, failed: str) -> Rows:
-    """Convert recorded time steps to the user's order of atoms, and to the labels and axes of another run."""
+    """Convert recorded steps to the user's order, labels and axes."""
     x, v = (in_user_order(segment.rows_of(name), segment.table.order) for name in ("x", "v"))
     energy = segment.rows_of("potential") + segment.rows_of("kinetic")
     nearest = segment.rows_of("nearest").astype(np.float64)

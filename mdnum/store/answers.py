@@ -1,9 +1,8 @@
-"""The file answers.json, which stores intermediate results so that a killed command can be resumed.
+"""The file answers.json, from which a killed command can be resumed.
 
-A command with many tests (`audit`, `conform`) keeps its options and results in one dataclass of plain values.
-A result that should not be lost is written at once; other results are written about once per second. A
-resumed command restores all values with their types, and runs the tests that have no result yet. The tables
-in the command's folder are created from the stored results.
+A command with many tests (`audit`, `conform`) keeps options and results in one dataclass. Important results
+are written at once, others about once per second. A resumed command restores all values, and runs the
+remaining tests. The tables in the command's folder are created from the stored results.
 """
 
 from __future__ import annotations
@@ -25,7 +24,7 @@ NAME = "answers.json"
 
 
 class Timed(Protocol):
-    """Protocol of a state that can be stored: a dataclass of plain values with the elapsed `seconds`."""
+    """Protocol of a state that can be stored, with the elapsed `seconds`."""
 
     seconds: float
 
@@ -46,7 +45,7 @@ class Answers(Generic[T]):
         self._before, self._began, self._due = state.seconds, monotonic(), 0.0
 
     def save(self, urgent: bool = True) -> None:
-        """Save the state for resuming the command; without `urgent`, save about once per second."""
+        """Save the state for resuming the command. Without `urgent`, about once per second."""
         now = monotonic()
         self.state.seconds = self._before + now - self._began
         if urgent or now >= self._due:
@@ -57,7 +56,7 @@ class Answers(Generic[T]):
 
 
 def take(path: str | Path, layout: Layout) -> RunFolder:
-    """Open the folder of a command that is to be resumed; no other process can then write into the folder.
+    """Open the folder of a command to resume. Other processes cannot write into it.
 
     Raises:
         FolderError: the folder has no state of this command, another process writes it, or it was changed.

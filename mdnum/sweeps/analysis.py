@@ -1,4 +1,4 @@
-"""Analysis of a sweep from its points on disk: means, differences, failures and recommended values."""
+"""Analysis of a sweep: means, differences, failures and recommended values."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ class _Results:
 
 
 def analyzed(place: Workspace, plan: Plan) -> tuple[dict[str, Any], dict[str, Any]]:
-    """Return the tables and the summary of a sweep, from the stored results of its points."""
+    """Return the tables and the summary of a sweep."""
     results = _read(place, plan)
     joint = [plan.setting(choices) for choices in plan.question.joint]
     along = {setting for axis in plan.axes for _, setting in plan.along(axis)}
@@ -141,7 +141,7 @@ def _along(
     reference: Setting,
     names: Sequence[str],
 ) -> dict[str, dict[str, Raw]]:
-    """Return the differences between several settings and a reference setting, by measure and by label."""
+    """Return the differences of settings from a reference, by measure and label."""
     found = {}
     for name in names:
         runs = results.values.get(name, {})
@@ -167,7 +167,7 @@ def _labels(plan: Plan, axis: Axis) -> dict[str, Setting]:
 
 
 def _all_differences(plan: Plan, means: Means, results: _Results) -> dict[tuple[str, ...], Raw]:
-    """Return the change of each measure if one choice has a value other than the system's own."""
+    """Return the change of each measure if one choice is changed."""
     found = {}
     for axis in plan.axes:
         each = _along(means, results, _labels(plan, axis), plan.origin, plan.names)
@@ -176,7 +176,7 @@ def _all_differences(plan: Plan, means: Means, results: _Results) -> dict[tuple[
 
 
 def _ends(plan: Plan, results: _Results) -> dict[tuple[str, ...], Any]:
-    """Return the change of each measure over the range of each choice's values, from a linear fit."""
+    """Return the change of each measure over a choice's range, from a linear fit."""
     choices, ends = {one.setting: one.point.choices for one in plan.points}, {}
 
     def share(axis: Axis, value: Any) -> float:
@@ -222,7 +222,7 @@ def _advice(
     compared: Mapping[tuple[str, ...], Difference],
     results: _Results,
 ) -> list[dict[str, Any]]:
-    """Return the recommended value of each choice; choices in `FREE` get the value with the fastest runs."""
+    """Return the recommended value of each choice. Choices in `FREE` get the fastest."""
     physical = {measure.name for measure in plan.measures if measure.physical}
     moving = {(key, value) for (name, key, value), one in compared.items() if one.moves and name in physical}
     rows = []
@@ -254,9 +254,9 @@ def _advice(
 
 
 def recommended(plan: Plan, advice: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
-    """Return two settings: all recommended values, and all converged values; an empty list if they are equal.
+    """Return the settings of all recommended and all converged values. Empty if equal.
 
-    Each choice was varied alone; runs with the two returned settings show the combined effect of all choices.
+    These settings show the combined effect of choices that were varied alone.
     """
     best = {row["choice"]: row["best"] for row in advice if row["best"] is not None}
     ends = {row["choice"]: row["end"] for row in advice if row["end"] is not None}
@@ -267,7 +267,7 @@ def recommended(plan: Plan, advice: Sequence[Mapping[str, Any]]) -> list[dict[st
 
 
 def _means(results: _Results, without: Collection[Setting] = ()) -> dict[tuple[str, Setting], SeedMean]:
-    """Return the mean over seeds of each measure at each setting, except for the settings in `without`."""
+    """Return the mean of each measure at each setting, over seeds."""
     return {
         (name, setting): mean
         for name, runs in results.values.items()
@@ -281,7 +281,7 @@ def _together(
     means: Means, results: _Results, joint: Sequence[Setting],
     tolerances: Mapping[str, float],
 ) -> dict[str, Any]:  # fmt: skip
-    """Compare results for two settings: with all recommended values, and with all converged values."""
+    """Compare the settings of all recommended and all converged values."""
     setting, end = joint
     found = _along(means, results, {"": setting}, end, list(tolerances))
     one = compared_with_end(setting, "", found, tolerances, len(tolerances))
@@ -293,7 +293,7 @@ def _together(
 
 
 def _fastest(plan: Plan, axis: Axis, moving: set[tuple[str, str]], results: _Results) -> dict[str, Any]:
-    """Return the value with the fastest runs among values that miss no pairs and do not change results."""
+    """Return the value with the fastest runs that misses no pairs and changes no results."""
     rows = []
     for value, setting in plan.along(axis):
         speeds, lost = np.array(results.speeds.get(setting, [(np.nan, 0)])).T

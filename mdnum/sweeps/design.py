@@ -1,7 +1,7 @@
-"""Design of a sweep: the varied choices, their values, and the points (settings with seeds) to run.
+"""Design of a sweep: the varied choices, their values, and the points to run.
 
-A choice is a key of the system file, or a name for several keys that are varied together (`precision`).
-Values of a choice are written as in a system file.
+A choice is a key of the system file, or a name for several keys (`precision`). Values of a choice are written
+as in a system file.
 """
 
 from __future__ import annotations
@@ -42,7 +42,7 @@ class Axis:
         return all(isinstance(one, int | float) and not isinstance(one, bool) for one in self.values)
 
     def settings(self, value: Any, world: str = "md") -> dict[str, Any]:
-        """Return the keys of the system file that a value of this choice changes, with their new values."""
+        """Return the keys and values of the system file for a value of this choice."""
         if self.key == "precision" and isinstance(value, str):
             return {f"precision.{role}": value for role in _ROLES[world]}
         return {self.key: value}
@@ -77,7 +77,7 @@ def parse(text: str) -> Axis:
 
 
 def checked(axis: Axis) -> Axis:
-    """Return an axis (a varied choice) unchanged; raise an error if its values are invalid.
+    """Return an axis unchanged. Raise an error if its values are invalid.
 
     Raises:
         InputError: there are no values, a value is not finite, or values are repeated.
@@ -111,7 +111,7 @@ def _range(text: str, low: Any, high: Any, step: Any) -> tuple[Any, ...]:
 
 
 def with_base(axis: Axis, base: Any) -> Axis:
-    """Return an axis (a varied choice) whose values include the base value; sort values that are numbers."""
+    """Return an axis with the base value among its values. Numbers are sorted."""
     same = [one for one in axis.values if one == base and type(one) is not bool]
     values = axis.values if same else (base, *axis.values)
     made = Axis(axis.key, values)
@@ -125,7 +125,7 @@ def points(
     design: Design = "one-at-a-time",
     samples: int = 0,
 ) -> list[Point]:
-    """Return all points, ordered by seed, so that an interrupted sweep has results for every setting.
+    """Return all points, ordered by seed.
 
     Args:
         base: the value of each axis that is kept while another axis is varied.
@@ -156,7 +156,7 @@ def points(
 
 
 def _filling(axes: Sequence[Axis], samples: int) -> list[dict[str, Any]]:
-    """Return settings from a scrambled Sobol sequence, between the extreme values of each varied choice."""
+    """Return settings from a scrambled Sobol sequence."""
     from scipy.stats import qmc
 
     if samples < 2 or samples & (samples - 1):

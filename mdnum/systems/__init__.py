@@ -1,6 +1,6 @@
-"""System files: their schema, and how a simulation is loaded, validated and built from a system file.
+"""System files: their schema, and how simulations are built from them.
 
-Importing this package does not import jax or jax_md; `build` and `Simulation` are imported on first use.
+`build` and `Simulation` are imported on first use, so that jax is not imported.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ def opened(system: Simulation | Named, overrides: Mapping[str, Any] | None = Non
 
 
 class _Package(ModuleType):
-    """Module type that keeps the names `build` and `build_ball` bound to functions, not to submodules."""
+    """Module type in which `build` and `build_ball` are functions, not submodules."""
 
     def __setattr__(self, name: str, value: Any) -> None:
         # Python binds an imported submodule to its package; here that would hide the function of its name

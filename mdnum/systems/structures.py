@@ -62,7 +62,7 @@ class Draw:
 
 
 def make(structure: schema.FileStructure | schema.BuilderStructure, units: str, folder: Path) -> Atoms:
-    """Create the atoms that a [structure] table describes, in float64 and without a calculator.
+    """Create the atoms of a [structure] table, in float64.
 
     Args:
         structure: the structure table.
@@ -95,7 +95,7 @@ def make(structure: schema.FileStructure | schema.BuilderStructure, units: str, 
 
 
 def species_of(atoms: Atoms) -> tuple[tuple[str, ...], Int64[np.ndarray, " atoms"]]:
-    """Return the sorted chemical symbols in a structure, and the index of each atom's symbol."""
+    """Return the sorted chemical symbols, and the symbol index of each atom."""
     from ase.data import chemical_symbols
 
     numbers, place = np.unique(atoms.numbers, return_inverse=True)
@@ -105,7 +105,7 @@ def species_of(atoms: Atoms) -> tuple[tuple[str, ...], Int64[np.ndarray, " atoms
 
 
 def ignored(structure: schema.FileStructure | schema.BuilderStructure, folder: Path) -> list[str]:
-    """Return the names of columns that look like velocities but are not read as velocities."""
+    """Return the names of columns that look like velocities but are not read."""
     if isinstance(structure, schema.BuilderStructure):
         return []
     return ignored_velocities(_read(folder / structure.file, structure.index).arrays)
@@ -233,7 +233,7 @@ def _check_finite(atoms: Atoms) -> None:
 
 
 def _check_size(atoms: Atoms, r_cut: float, length: str) -> None:
-    """Raise an error if coordinates are so large that rounding makes pair distances inaccurate."""
+    """Raise an error if coordinates are so large that distances become inaccurate."""
     farthest = _FARTHEST * r_cut
     places = np.abs(atoms.positions).max(axis=1)
     if (places > farthest).any():
@@ -271,12 +271,12 @@ def _check_width(cell: Cell, r_cut: float, skin: float, length: str) -> None:
 
 
 def repeats(cell: Cell, r_list: float) -> str:
-    """Return how often the box must be repeated along a, b and c for the minimum-image convention."""
+    """Return the repeats along a, b and c that the minimum image needs."""
     return " x ".join(str(max(1, math.ceil(2 * r_list / width))) for width in cell.widths)
 
 
 def smallest_distance(kind: str, units: str, sigmas: Sequence[float] = ()) -> float:
-    """Return the smallest distance of two atoms that is allowed for this potential, in length units."""
+    """Return the smallest allowed distance of two atoms (a length)."""
     if kind == "soft-sphere":
         # soft spheres may overlap; only coinciding centers, where the force has no direction, are wrong
         return 1e-9
@@ -310,7 +310,7 @@ def _check_overlap(atoms: Atoms, cell: Cell, smallest: float, length: str) -> No
 def _nearest(
     atoms: Atoms, within: float
 ) -> tuple[Float64[np.ndarray, " atoms"], Int64[np.ndarray, " atoms"], int]:
-    """Find each atom's nearest neighbor within a distance, and count the pairs closer than this distance."""
+    """Find each atom's nearest neighbor within a distance, and count closer pairs."""
     from scipy.spatial import KDTree
 
     count = len(atoms)
@@ -325,7 +325,7 @@ def _nearest(
 
 
 def nearest_distance(atoms: Atoms, within: float) -> float:
-    """Return the distance of the closest pair of atoms, or `within` if all pairs are farther apart."""
+    """Return the smallest distance of two atoms. It is at most `within`."""
     from scipy.spatial import KDTree
 
     places, _ = with_images(atoms, within)
@@ -336,7 +336,7 @@ def nearest_distance(atoms: Atoms, within: float) -> float:
 def with_images(
     atoms: Atoms, reach: float
 ) -> tuple[Float64[np.ndarray, "places 3"], Int64[np.ndarray, " places"]]:
-    """Return the positions of all atoms and of nearby images, and the atom index of each position."""
+    """Return positions of atoms and nearby images, and their atom indices."""
     from mdnum.md.cell import complete
 
     cell = complete(atoms.cell.array, atoms.pbc)
@@ -366,7 +366,7 @@ _LONGEST_HEAD = 1000
 
 
 def _from_extxyz(path: Path) -> Atoms | None:
-    """Read atoms from a file that `to_extxyz` wrote; return None if the file has another format."""
+    """Read atoms from a file by `to_extxyz`. None for other formats."""
     from ase import Atoms
     from pyarrow import ArrowInvalid, csv
 
@@ -404,7 +404,7 @@ def _from_extxyz(path: Path) -> Atoms | None:
 
 
 def to_extxyz(atoms: Atoms, names: Sequence[str] = ("momenta", "masses")) -> str:
-    """Return extended XYZ text that keeps every bit of each float64 (ASE's writer keeps 8 decimals).
+    """Return extended XYZ text that keeps every bit of each float64.
 
     Args:
         atoms: any atoms.

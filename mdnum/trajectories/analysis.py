@@ -1,9 +1,8 @@
 """Analysis of flips as an MDAnalysis class, `NeighborFlips(universe, r_cut=8.5).run().results.flips`.
 
-Frames may be distributed over processes. A flip is found by comparing two successive frames, so each process
-also reads the frame before its first frame. No flip is lost at a process boundary, and the results are
-bitwise identical to those of a single process. If two processes find different pairs at the frame that both
-read, an error is raised.
+Frames may be distributed over processes. Each process also reads the frame before its first frame. The
+results are therefore bitwise those of a single process. An error is raised if two processes differ at this
+frame.
 """
 
 from __future__ import annotations
@@ -55,7 +54,7 @@ class RuleResult:
 
     @property
     def ambiguous(self) -> float:
-        """Fraction of flips that are uncertain at the resolution of the file; nan if there are no flips."""
+        """Fraction of flips that are uncertain in the file. nan without flips."""
         return float(self.flips.ambiguous.mean()) if len(self.flips) else float("nan")
 
     def entered(self) -> Int[np.ndarray, "frames"]:
@@ -72,7 +71,7 @@ class RuleResult:
 
 @dataclass
 class _ProcessPart:
-    """Results of one process for one membership rule; frame 0 is the first frame that the process reads."""
+    """Results of one process for one membership rule."""
 
     flips: list[FlipTable] = field(default_factory=lambda: [FlipTable.none()])  # of frames that have any
     rows: list[tuple[int, int, float]] = field(default_factory=list)  # (pairs, near, smallest margin)
@@ -80,13 +79,13 @@ class _ProcessPart:
     last: Members | None = None  # the pairs inside at its last frame; None where it has none
 
     def end(self, last: Members) -> None:
-        """Store the pairs inside the cutoff at the last frame, and join the flips into a single table."""
+        """Store the pairs inside the cutoff at the last frame. Join the flips."""
         self.last, self.flips = last if self.rows else None, [FlipTable.concatenate(self.flips)]
 
 
 @dataclass
 class _Guarded:
-    """Iterator over frames of a trajectory; each frame is checked before MDAnalysis reads it."""
+    """Iterator over frames. Each is checked before MDAnalysis reads it."""
 
     analysis: NeighborFlips
     numbers: np.ndarray
@@ -100,20 +99,18 @@ class _Guarded:
 
 
 class NeighborFlips(AnalysisBase):
-    """MDAnalysis analysis that finds the pairs entering or leaving a cutoff between successive frames.
+    """MDAnalysis analysis of the pairs that enter or leave a cutoff.
 
-    After `run` with one rule, `results` has all attributes of `RuleResult` (`flips`, `pairs`, `near`,
-    `min_margin`, `initial`, `last`, `contacts`, `occupancy`). With several rules, each element of
-    `results.rules` is a `RuleResult`. Tables have a method `to_pandas()`. With by="residue", the pairs are
-    pairs of residues. `i` and `j` are row numbers of `results.residues`, and `results.left_out` counts the
-    excluded atoms. `results.resolution` is the resolution of positions in the file. `results.bound` contains
-    the error bound of a distance in each frame. `results.repeats` lists the frames that repeat earlier frames
-    (see `repeats.RepeatedFrames`). `results.other_box` gives another possible box of the first frame and a
-    reason (see `Trajectory.other_box`), or None. `frames` and `times` list the numbers and times of the
-    frames analyzed; `FlipTable.frame` is an index into both.
+    With one rule, `results` has the attributes of `RuleResult` (`flips`, `pairs`, `near`, `min_margin`,
+    `initial`, `last`, `contacts`, `occupancy`). With several rules, each element of `results.rules` is a
+    `RuleResult`. Tables have a method `to_pandas()`. With by="residue", the pairs are pairs of residues. `i`
+    and `j` are row numbers of `results.residues`. `results.left_out` counts excluded atoms.
+    `results.resolution` is the resolution of positions in the file. `results.bound` contains the error bound
+    of a distance in each frame. `results.repeats` lists the frames that repeat earlier frames (see
+    `repeats.RepeatedFrames`). `results.other_box` is another possible first box (see `Trajectory.other_box`),
+    or None. `frames` and `times` list the analyzed frames. `FlipTable.frame` is an index into both.
 
-    If a frame cannot be read or contains impossible values, an error with the frame number is raised. The
-    results of all earlier frames are kept.
+    An error names the frame that cannot be read or is impossible. The results of all earlier frames are kept.
 
     Args:
         universe_or_atomgroup: the atoms that form pairs.
@@ -227,7 +224,7 @@ class NeighborFlips(AnalysisBase):
     def _setup_computation_groups(
         self, n_parts: int, start: Any = None, stop: Any = None, step: Any = None, frames: Any = None
     ) -> list[np.ndarray]:
-        """Split the frames into groups as MDAnalysis does, and determine properties common to all groups."""
+        """Split the frames into groups as MDAnalysis does."""
         groups = super()._setup_computation_groups(n_parts, start, stop, step, frames)
         # who names the frames gets those
         self._to_the_end = frames is None and (stop is None or stop > len(self._trajectory))
@@ -322,7 +319,7 @@ class NeighborFlips(AnalysisBase):
         self.results.digests[0].append(self._digest)
 
     def _examined(self, ts: Any) -> tuple[float, list[FlipTable]]:
-        """Return the error bound of a distance at an MDAnalysis timestep, and the flips of each rule."""
+        """Return the error bound of a distance at a timestep, and the flips by rule."""
         frame = self._check(self.library.frame(ts, int(ts.frame)))
         self._digest = digest(frame)
         bound = self._bound_of(frame) if self._bound is None else self._bound
@@ -374,7 +371,7 @@ class NeighborFlips(AnalysisBase):
         return str(getattr(self._trajectory, "filename", None) or "the trajectory")
 
     def _behind_the_last(self) -> FrameError | None:
-        """Return an error if the file contains data after the last frame known to MDAnalysis, else None."""
+        """Return an error if data follow the last frame known to MDAnalysis, else None."""
         rest = left_over(self._trajectory) if self._to_the_end and len(self._numbers) else None
         count, where = int(self._trajectory.n_frames), self._where
         said = f"frame {count} cannot be read ({rest})"
@@ -382,9 +379,9 @@ class NeighborFlips(AnalysisBase):
 
 
 def _changed(before: Frame, after: Frame) -> float:
-    """Return the largest change that transformations cause in the distance between atoms k and k + 1.
+    """Return the largest change of the distance of atoms k and k + 1 by transformations.
 
-    Shifts of atoms by lattice vectors and rotations of the system do not count as changes.
+    Shifts by lattice vectors and rotations do not count.
     """
     if before is after:
         return 0.0
@@ -395,7 +392,7 @@ def _changed(before: Frame, after: Frame) -> float:
 
 
 def _joined(rule: Rule, parts: Sequence[_ProcessPart]) -> RuleResult:
-    """Concatenate the results of all processes, and number frames from the first frame of the analysis."""
+    """Concatenate the results of all processes, with frames counted from the first."""
     tables, done, last = [FlipTable.none()], 0, None
     for part in parts:
         if last is not None and part.first is not None and not last.equals(part.first):
@@ -417,7 +414,7 @@ def _joined(rule: Rule, parts: Sequence[_ProcessPart]) -> RuleResult:
 
 
 def _group_of(atoms: Any, name: str) -> AtomGroup:
-    """Return the atom group; reject other objects, empty groups, and groups that change between frames."""
+    """Return the atom group. Reject empty groups, and groups that change."""
     if isinstance(atoms, UpdatingAtomGroup):
         raise InputError(
             f"the group {name} changes from frame to frame, so pairs that leave the group would be counted "

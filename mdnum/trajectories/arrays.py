@@ -1,7 +1,7 @@
-"""Trajectories in memory: a program passes frames, one after another, as numpy, jax or torch arrays.
+"""Trajectories in memory: a program passes frames one by one.
 
-ASE, vesin and torch-sim store lattice vectors as rows of a matrix (`cell`). jax-md stores the vectors as
-columns of an upper triangular matrix (`box`), and often stores positions as fractions of the box.
+ASE, vesin and torch-sim store lattice vectors as rows (`cell`). jax-md stores them as columns (`box`), and
+often uses fractional positions.
 """
 
 from __future__ import annotations
@@ -52,7 +52,7 @@ def host(values: Any, name: str, kinds: str = "fiu") -> np.ndarray:
 
 
 class ArrayFrames(Trajectory):
-    """Trajectory of frames that a program passes one by one; each is kept until the next one is examined.
+    """Trajectory of frames that a program passes one by one.
 
     Args:
         name: name of the frames on a results page.
@@ -154,7 +154,7 @@ class ArrayFrames(Trajectory):
 
     @classmethod
     def of(cls, frames: Any, reach: float, velocities: Any = None, **options: Any) -> ArrayFrames:
-        """Make a trajectory from an array of frames or a list of ASE Atoms; `reach` is the longest cutoff."""
+        """Make a trajectory from an array or ASE Atoms. `reach` is the longest cutoff."""
         given = {name: options.pop(name) for name in ("cell", "box") if name in options}
         found, given["velocities"] = cls("array", **options), velocities
         found.reach = reach
@@ -178,7 +178,7 @@ class ArrayFrames(Trajectory):
         return self._waiting[0]
 
     def sample(self) -> list[Frame]:
-        """Return the first frames of the trajectory, or as many of them as are available so far."""
+        """Return the first frames of the trajectory, as far as available."""
         return list(self._first)
 
     @contextmanager

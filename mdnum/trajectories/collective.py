@@ -1,7 +1,7 @@
-"""Detection of file damage that appears as an impossible motion of all atoms, with finite coordinates.
+"""Detection of damaged files by an impossible motion of all atoms.
 
-A counter overflow gives every atom the same value of one coordinate, and a misread offset shifts all atoms.
-Planar systems, linear systems, drift and wrapping are not reported as damage.
+A counter overflow makes a coordinate equal for all atoms. A wrong offset shifts all atoms. Planar systems,
+linear systems, drift and wrapping are not reported as damage.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ _FAR, _FAR_FEW = 300.0, 1e4
 
 @dataclass
 class Collective:
-    """Extents and positions of a sample of the atoms in the frames examined so far."""
+    """Extents and positions of sampled atoms in the frames examined so far."""
 
     least: Float[np.ndarray, "3"] | None = None  # the smallest of `spreads` in any of them, length
     last: Float[np.ndarray, "some 3"] | None = None  # positions in the last one
@@ -35,7 +35,7 @@ class Collective:
     level: Bool[np.ndarray, "3"] | None = None  # coordinates that all atoms had in common in each of them
 
     def refuse(self, x: Float[np.ndarray, "some 3"], atoms: int, side: float, far: float) -> str | None:
-        """Return the reason why the motion of all atoms to their present positions is impossible, or None.
+        """Return why the motion of all atoms is impossible, or None.
 
         Args:
             x: positions of a sample of the atoms, which represents all atoms.
@@ -69,7 +69,7 @@ class Collective:
         return None
 
     def left(self, x: Float[np.ndarray, "some 3"], atoms: int) -> str:
-        """Describe coordinates that were equal for all atoms but suddenly differ; "" if there are none."""
+        """Describe coordinates that were equal for all atoms until this frame. Otherwise ""."""
         last, was, level = self.last, self.level, (x == x[0]).all(axis=0)
         self.level = level if was is None else was & level
         if last is None or was is None or atoms <= _FEW or not was.any() or np.any(self.level):
@@ -84,17 +84,16 @@ class Collective:
 
 
 def spreads(x: Float[np.ndarray, "atoms 3"]) -> Float[np.ndarray, "3"]:
-    """Return the standard deviations of positions along the principal axes, a length, in ascending order."""
+    """Return standard deviations of positions (lengths) along the principal axes, ascending."""
     away = x - x.mean(axis=0)
     return np.sqrt(np.maximum(np.linalg.eigvalsh(away.T @ away / len(x)), 0.0))
 
 
 def _flat(now: np.ndarray, before: np.ndarray, atoms: int, constant: bool) -> str | None:
-    """Describe the plane, line or point into which all atoms have collapsed; None without a collapse.
+    """Describe the plane, line or point into which all atoms collapsed, or None.
 
-    Rippled sheets may become flat, and bent chains may become straight, in a correct file. A collapse is
-    reported only if, in earlier frames, the sheet or chain was thicker than the distance between neighboring
-    atoms. If all atoms share a coordinate, the thickness must only exceed a fifth of the largest extent.
+    In a correct file, rippled sheets may become flat. A collapse is reported only if the thickness exceeded
+    the distance of neighbors before. If all atoms share a coordinate, a fifth of the extent is enough.
     """
     thin, middle, long = now <= _COLLAPSED * before
     if before[2] > 0 and (long if atoms > _FEW else now[2] == 0):
@@ -107,9 +106,9 @@ def _flat(now: np.ndarray, before: np.ndarray, atoms: int, constant: bool) -> st
 
 
 def _most_alike(x: Float[np.ndarray, "some 3"]) -> tuple[float, int, float]:
-    """Return (largest fraction of atoms with the same coordinate, axis of this coordinate, its value).
+    """Return the largest fraction of equal coordinates, their axis and their value.
 
-    The fraction of the second most frequent value is subtracted, as crystals have many equal coordinates.
+    The second largest fraction is subtracted, as crystals have many equal coordinates.
     """
     ordered = np.sort(x, axis=0)
     repeated = np.count_nonzero(ordered[1:] == ordered[:-1], axis=0)
@@ -122,7 +121,7 @@ def _most_alike(x: Float[np.ndarray, "some 3"]) -> tuple[float, int, float]:
 
 
 def _shift(before: np.ndarray, now: np.ndarray, far: float) -> float:
-    """Return the length of a displacement common to all atoms; 0 if it is small or atoms move differently."""
+    """Return the length of a displacement common to all atoms. 0 if there is none."""
     moved = now - before
     if len(now) < 2 or not far or np.abs(moved).max() <= far / (2 * _SUDDEN):
         return 0.0

@@ -1,7 +1,7 @@
-"""One frame of a trajectory in float64, and checks for values that no simulation can produce.
+"""One frame of a trajectory in float64, and checks for impossible values.
 
 Formats with plain floats (dcd, trr, netcdf) accept any bytes as coordinates. File damage often produces a
-huge coordinate. A huge coordinate in an accepted frame increases the rounding bound of every pair.
+huge coordinate. A huge coordinate increases the rounding bound of every pair.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ AtomIndices = Int[np.ndarray, "chosen"] | None
 
 @dataclass(frozen=True)
 class Box:
-    """Lattice vectors of a box, and the directions in which the box is periodic."""
+    """Lattice vectors of a box, and its periodic directions."""
 
     # rows, length; those of directions that do not repeat do not matter
     matrix: Float[np.ndarray, "3 3"] = field(default_factory=lambda: np.zeros((3, 3)))
@@ -49,14 +49,14 @@ class Box:
 
     @cached_property
     def longest(self) -> float:
-        """Length of the longest lattice vector; 0 if the box is not finite or not fully periodic."""
+        """Length of the longest lattice vector. 0 if the box is not finite or not fully periodic."""
         if not np.all(self.pbc) or not np.isfinite(self.matrix).all():
             return 0.0
         return float(np.linalg.norm(self.matrix, axis=1).max())
 
     @cached_property
     def shortest(self) -> float:
-        """Length of the shortest lattice vector along periodic directions; 0 if no direction is periodic."""
+        """Length of the shortest periodic lattice vector. 0 if there is none."""
         return float(np.linalg.norm(self.matrix[self.pbc], axis=1).min()) if self.periodic else 0.0
 
     @cached_property
@@ -84,7 +84,7 @@ class Frame:
 
     @cached_property
     def furthest(self) -> float:
-        """Largest absolute coordinate of all atoms, in length units; not finite if any coordinate is not."""
+        """Largest absolute coordinate of all atoms (a length). It may be infinite or NaN."""
         return furthest(self.positions)
 
     def furthest_of(self, atoms: AtomIndices) -> float:
@@ -94,7 +94,7 @@ class Frame:
 
 @dataclass
 class FrameCheck:
-    """Check that rejects frames with impossible values, and frames inconsistent with the first frame.
+    """Check that rejects impossible frames, and frames inconsistent with the first.
 
     Raises:
         FrameError: a coordinate is not finite; an atom is impossibly far away, or so far away that floats do
@@ -120,7 +120,7 @@ class FrameCheck:
         return frame
 
     def _wrong(self, frame: Frame) -> Iterator[tuple[str, str]]:
-        """Yield (problem, remedy) for each failed check; each check assumes that previous checks passed."""
+        """Yield (problem, remedy) for each failed check."""
         atoms = self.atoms
         self.pbc = pbc = frame.box.pbc if self.pbc is None else self.pbc
         self.labels = labels = frame.labels if self.labels is None else self.labels
@@ -200,9 +200,9 @@ def far_out(
     bits: int = 64,
     before: Float[np.ndarray, "some 3"] | None = None,
 ) -> tuple[int, int, str] | None:
-    """Return the atom farthest from the others if it is impossibly far away (arguments as in `FrameCheck`).
+    """Return the atom farthest from the others if this is impossible (arguments as in `FrameCheck`).
 
-    The system size is also estimated from the previous frame, since the current frame may be damaged.
+    The previous frame also gives the system size, since this frame may be damaged.
 
     Returns:
         (the atom, the number of impossibly distant atoms, the reason in words), or None.
@@ -235,9 +235,9 @@ def far_out(
 
 
 def leap(before: Frame, now: Frame, atoms: AtomIndices = None) -> tuple[int, float] | None:
-    """Return the atom that moved farthest since the previous frame if its displacement is impossibly large.
+    """Return the atom that moved farthest if this displacement is impossible.
 
-    A jump by a lattice vector, as when atoms are wrapped into the box, does not count as a displacement.
+    A jump by a lattice vector does not count.
 
     Returns:
         (the atom, the length of its displacement); None if no displacement is impossible.
@@ -263,5 +263,5 @@ def furthest(x: Float[np.ndarray, "atoms 3"]) -> float:
 
 
 def _named(at: Any, atoms: AtomIndices) -> int:
-    """Convert the index of an atom among the selected atoms to the number of the atom in the file."""
+    """Convert the index among selected atoms to the number in the file."""
     return int(at if atoms is None else atoms[at])

@@ -1,8 +1,7 @@
-"""Pairs inside a cutoff that a program's neighbor list lacks, and how long each pair is missing.
+"""Pairs inside a cutoff that a neighbor list lacks, and for how long.
 
-A neighbor list may be incomplete because the skin was exceeded, a buffer overflowed, or images are not
-supported. A program with an incomplete list omits the interactions of the missing pairs inside the cutoff.
-Missing pairs whose distance equals the cutoff within its error bound are not counted.
+A list is incomplete if the skin was exceeded, a buffer overflowed, or images are not supported. The program
+then omits the interactions of the missing pairs. Pairs at the cutoff (within the error) are not counted.
 """
 
 from __future__ import annotations
@@ -50,7 +49,7 @@ def _same(given, known):
 
 
 class GivenList(NamedTuple):
-    """Neighbor list of a program, without padding and sorted by the first atom of each entry."""
+    """Neighbor list of a program, without padding and sorted by atom."""
 
     shifted: bool  # whether it says which image each neighbor is; else the nearest alone
     full: bool  # whether it has each pair from both of its atoms; else from the lower one here
@@ -92,11 +91,11 @@ class GivenList(NamedTuple):
         return cls(shifted, full, np.searchsorted(i, np.arange(atoms + 1, dtype=i.dtype)), i, j, image)
 
     def has(self, i: np.ndarray, j: np.ndarray, image: np.ndarray) -> Bool[np.ndarray, "pairs"]:
-        """Return True for each given pair that the list contains; the search is fastest if i is sorted."""
+        """Return True for each pair in the list. Sorted i are fastest."""
         return _has(self.first, self.j, self.image, i, j, image, self.shifted)
 
     def missing(self, frame: Frame, pairs: Members) -> Int[np.ndarray, "pairs"]:
-        """Return the number of missing entries of each pair: up to 2 if a list has both (i, j) and (j, i)."""
+        """Return the number of missing entries of each pair, up to 2 in a full list."""
         i, j, image, near = pairs.i, pairs.j, np.zeros(len(pairs), np.int64), pairs.rank == 0
         if self.shifted:
             image, near = _image(*image_shifts(frame, pairs).T), np.True_
@@ -150,7 +149,7 @@ def _has(first, other, images, i, j, image, shifted):
 
 
 def arrays_of(neighbors: Any, atoms: int) -> list[np.ndarray]:
-    """Return i, j and optional shifts of a neighbor list in any form supported by `mdnum.Recorder.see`."""
+    """Return i, j and optional shifts of a neighbor list in any supported form."""
     given = getattr(neighbors, "idx", neighbors)
     shifts = getattr(neighbors, "shifts", None)
     given = [*(given if isinstance(given, tuple) else (given,)), *(() if shifts is None else (shifts,))]
@@ -169,7 +168,7 @@ def arrays_of(neighbors: Any, atoms: int) -> list[np.ndarray]:
 
 
 class ListCheck:
-    """Comparison of a neighbor list with the pairs inside the cutoff at each frame."""
+    """Comparison of a neighbor list with the true pairs at each frame."""
 
     def __init__(self, rule: Rule) -> None:
         self._rule = rule
@@ -182,7 +181,7 @@ class ListCheck:
         self._open: dict[tuple[int, int, int], tuple[int, int, int, float]] = {}
 
     def given(self, neighbors: Any, species: np.ndarray) -> GivenList:
-        """Return the neighbor list as a `GivenList`; an unchanged list gives the same object again."""
+        """Return the list as a `GivenList`. An unchanged list gives the same object."""
         if self._newest is None:
             if self._rule.directed:
                 message = f"a neighbor list needs a cutoff, but the rule is {self._rule.name}"
@@ -207,7 +206,7 @@ class ListCheck:
         flips: Mapping[str, np.ndarray],
         now: GivenList,
     ) -> tuple[dict[str, Any], list[dict[str, Any]]]:
-        """Compare a list with the pairs inside the cutoff; return (results, rows of pairs that were missing).
+        """Compare a list with the true pairs. Return (results, rows of pairs that were missing).
 
         Args:
             at: index of the frame among the frames examined.
@@ -250,7 +249,7 @@ class ListCheck:
         return row, self.ended(at, tracker.bound, {key: known[key] for key in gone})
 
     def _drops(self, earlier: GivenList, now: GivenList, frame: Frame, before: Frame, placed: Placed) -> bool:
-        """Return True if the list may lack pairs inside the cutoff that the previous list contained."""
+        """Return True if the list may lack pairs that it contained before."""
         i, j, image, reach = earlier.i, earlier.j, earlier.image, self._rule.reach
         x, (matrix, inverse) = placed.positions, cell_of(frame)
         if (earlier.shifted, earlier.full) != (now.shifted, now.full):
@@ -273,7 +272,7 @@ class ListCheck:
         return bool((distance <= self._radii[self._kinds[i], self._kinds[j]] + placed.rounding).any())
 
     def ended(self, at: int, bound: float, stays: Mapping[Any, Any] | None = None) -> list[dict[str, Any]]:
-        """Return table rows of pairs missing until frame `at` (only pairs in `stays`, if given)."""
+        """Return table rows of pairs missing until frame `at`. `stays` restricts the pairs."""
         names = ("i", "j", "rank", "missing", "begin", "number", "deepest", "end")
         held = sorted((self._open if stays is None else stays).items())
         rows = [(*key, *told, at) for key, told in held if told[-1] > bound]

@@ -1,8 +1,8 @@
-"""Contacts between residues: two residues are in contact if any pair of their atoms is within the cutoff.
+"""Contacts between residues: a pair of their atoms is within the cutoff.
 
 Decisions are made for pairs of atoms. The stored distance of two residues is the smallest distance between
-their atoms. Hydrogens and virtual sites are excluded by default, because their positions depend on
-constraints and on the program that wrote the file. Customary contact cutoffs are defined for heavy atoms.
+their atoms. Hydrogens and virtual sites are excluded by default, as their positions depend on constraints.
+Customary contact cutoffs are defined for heavy atoms.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ _TOGETHER = 20_000
 
 @dataclass(frozen=True)
 class ByResidue:
-    """Residues of a file, for an analysis of pairs of residues instead of pairs of atoms."""
+    """Residues of a file, for an analysis by residue pairs."""
 
     of: Int[np.ndarray, "atoms"]  # residue of each atom of the file
     table: AtomTable  # of the residues, an entry each
@@ -45,7 +45,7 @@ class ByResidue:
 
     @classmethod
     def make(cls, table: AtomTable, groups: Groups, hydrogens: bool, rules: Sequence[Rule]) -> ByResidue:
-        """Build the residues of a file; `hydrogens` is True to include hydrogens and virtual sites.
+        """Build the residues of a file. `hydrogens` includes hydrogens and virtual sites.
 
         Raises:
             InputError: the file has no residues, no atom is left, or a rule is not defined for pairs of
@@ -86,12 +86,12 @@ class ByResidue:
         return first, second
 
     def tracker(self, rule: Rule, species: Sequence[str] | None, bound: float = 0.0) -> ResidueTracker:
-        """Return a tracker of residue contacts, as defined by a membership rule for atoms."""
+        """Return a tracker of residue contacts for a rule for atoms."""
         return ResidueTracker(rule, self, species, bound)
 
 
 def left_out(table: AtomTable) -> tuple[Bool[np.ndarray, "atoms"], Bool[np.ndarray, "atoms"]]:
-    """Return a mask of hydrogens, found by element, and a mask of virtual sites, found by name."""
+    """Return masks of hydrogens (by element) and of virtual sites (by name)."""
     water = {str(name) for name in np.unique(table.residue_names.astype(str)) if _WATER.fullmatch(str(name))}
     virtual = [
         _VIRTUAL.fullmatch(str(name)) is not None or (name in _OF_WATER and residue in water)
@@ -102,10 +102,10 @@ def left_out(table: AtomTable) -> tuple[Bool[np.ndarray, "atoms"], Bool[np.ndarr
 
 
 class ResidueTracker:
-    """Tracker of contacts between residues, with the same interface as `Tracker` for pairs of atoms.
+    """Tracker of contacts between residues, used like `Tracker`.
 
-    Pairs of atoms within one residue are ignored. `near` counts atom pairs whose distance equals the cutoff
-    within rounding error; two residues may have several such pairs. The attribute `min_margin` is always inf.
+    Pairs of atoms within one residue are ignored. `near` counts atom pairs at the cutoff, within rounding.
+    Two residues may have several. The attribute `min_margin` is always inf.
 
     Args:
         rule: membership rule for atoms.
@@ -138,7 +138,7 @@ class ResidueTracker:
 
     @property
     def near(self) -> int:
-        """Number of atom pairs whose distance equals the cutoff within the error bound at the last frame."""
+        """Number of atom pairs at the cutoff, within the error, at the last frame."""
         return self._atoms.near
 
     @property
@@ -175,14 +175,14 @@ class ResidueTracker:
         )  # fmt: skip
 
     def members(self) -> Members:
-        """Return the pairs of residues in contact at the last frame, with their smallest distances."""
+        """Return residue pairs in contact at the last frame, and their smallest distances."""
         if self._last is None:
             return Members.none()
         i, j = np.divmod(self._pairs, self._count)
         return Members(i, j, np.zeros_like(i), self._closest(self._last, i, j)[0])
 
     def _closest(self, frame: Frame, i: np.ndarray, j: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """For each residue pair, return distance and threshold of the atom pair with the largest margin."""
+        """Return distance and threshold of the atom pair with the largest margin by residue pair."""
         placed, found = self._placed(frame), np.full((2, len(i)), np.inf)
         for begin in range(0, len(i), _TOGETHER):
             part = slice(begin, begin + _TOGETHER)
@@ -212,7 +212,7 @@ class ResidueTracker:
 
 
 def _by_residue(atoms: np.ndarray | None, of: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return the atoms sorted by residue, and the index at which each residue starts, plus the end index."""
+    """Return the atoms sorted by residue, and where each residue starts."""
     atoms = np.arange(len(of)) if atoms is None else atoms
     order = atoms[np.argsort(of[atoms], kind="stable")]
     return order, np.searchsorted(of[order], np.arange(count + 1))
@@ -220,7 +220,7 @@ def _by_residue(atoms: np.ndarray | None, of: np.ndarray, count: int) -> tuple[n
 
 @dataclass(frozen=True)
 class Occupancy(Columns):
-    """Sparse matrix of the fraction of frames in which residues i and j were in contact, sorted by (i, j)."""
+    """Sparse matrix of the fraction of frames in contact, by residues i and j."""
 
     i: Int[np.ndarray, "pairs"]  # the pair
     j: Int[np.ndarray, "pairs"]
@@ -231,7 +231,7 @@ class Occupancy(Columns):
 
     @classmethod
     def of(cls, stays: Contacts, frames: int) -> Occupancy:
-        """Add up the contacts of each pair of residues over the given number of frames."""
+        """Add up the contacts of each residue pair over the frames."""
         new = np.append(True, (np.diff(stays.i) != 0) | (np.diff(stays.j) != 0))[: len(stays)]
         heads, where = np.flatnonzero(new), np.cumsum(new) - 1
         weights = (stays.length, stays.began, stays.ended)
@@ -252,7 +252,7 @@ class ResidueNames(Columns):
 def contacts_over_time(
     stays: Contacts, residues: int, frames: int
 ) -> tuple[Int[np.ndarray, "moments"], Float[np.ndarray, "residues moments"]]:
-    """Return the first frame of each interval, and each residue's mean number of contacts per interval."""
+    """Return the first frame of each interval, and mean contacts of each residue."""
     edges = np.unique(np.linspace(0, frames, min(frames, MOMENTS) + 1).astype(np.int64))
     found = np.zeros((residues, len(edges) - 1))
     for k, (low, high) in enumerate(pairwise(edges)):

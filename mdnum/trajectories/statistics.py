@@ -1,14 +1,14 @@
-"""Statistics of contact durations, including partly observed contacts, and of the pairs that flip.
+"""Statistics of contact durations and of pairs that flip.
 
 Three quantities describe the durations of contacts:
 
-- The **lifetime** is estimated from contacts whose beginning was observed. Contacts that continue after the
-  last frame are right-censored (Kaplan and Meier, J. American Statistical Association 53, 457, 1958).
-- The **mean by rate** is the total contact time divided by the number of observed contact ends. The mean by
-  rate includes partly observed contacts, and equals the mean lifetime if contacts end at a constant rate.
-- The **residence** at a lag is the fraction of the pairs in contact at a frame that stay in contact during
-  the lag (Impey, Madden and McDonald, J. Phys. Chem. 87, 5071, 1983). Long contacts are sampled more often,
-  so the residence differs from the lifetime.
+- The **lifetime** is estimated from contacts whose beginning was observed. Contacts after the last frame are
+  right-censored (Kaplan, Meier, J. American Statistical Association 53, 457, 1958).
+- The **mean by rate** is the contact time per observed contact end. It is the mean lifetime if contacts end
+  at a constant rate.
+- The **residence** is the fraction of pairs that stay in contact during a lag (Impey, Madden and McDonald, J.
+  Phys. Chem. 87, 5071, 1983). Long contacts are sampled more often, so the residence differs from the
+  lifetime.
 
 Durations are numbers of frames. Counts for disjoint subsets of the pairs can be added.
 """
@@ -36,7 +36,7 @@ _CLASSES = 60
 
 @dataclass(frozen=True)
 class Durations(Sums):
-    """Histograms of contact durations: entry n is the number of contacts that lasted n frames."""
+    """Histograms of contact durations: entry n counts the contacts of n frames."""
 
     seen: Int[np.ndarray, "lengths"]  # seen to begin and to end
     goes_on: Int[np.ndarray, "lengths"]  # seen to begin, but not to end (censored on the right)
@@ -62,7 +62,7 @@ class Durations(Sums):
 
     @property
     def exposure(self) -> int:
-        """Number of times that a pair was in contact at a frame and was examined again at the next frame."""
+        """Number of pairs in contact at a frame and examined at the next, summed over frames."""
         length = np.arange(len(self.seen))
         # a stay of n frames that goes on after the last one has been examined again n - 1 times
         whole, cut = self.seen + self.older, self.goes_on + self.throughout
@@ -76,7 +76,7 @@ class Durations(Sums):
 
 @dataclass(frozen=True)
 class Survival:
-    """Fraction of contacts that last longer than n frames, from contacts whose beginning was observed."""
+    """Fraction of contacts that last longer than n frames."""
 
     frames: Int[np.ndarray, "points"]  # lengths at which some ended, from 1, rising
     share: Float[np.ndarray, "points"]  # still inside after that many frames
@@ -85,13 +85,13 @@ class Survival:
     longest: int  # frames for which any was followed: nothing is known beyond
 
     def at(self, share: float) -> int | None:
-        """Return the shortest duration that at most a fraction `share` of contacts exceeds, or None."""
+        """Return the shortest duration that at most a fraction `share` exceeds, or None."""
         below = np.flatnonzero(self.share <= share)
         return int(self.frames[below[0]]) if len(below) else None
 
     @property
     def mean(self) -> float:
-        """Area below the survival curve up to `longest`: a lower bound of the mean duration, in frames."""
+        """Area below the survival curve: a lower bound of the mean duration, in frames."""
         edges = np.concatenate([[0], self.frames, [self.longest]])
         return float(np.sum(np.diff(edges) * np.concatenate([[1.0], self.share])))
 
@@ -99,8 +99,7 @@ class Survival:
 def survival(found: Durations) -> Survival:
     """Compute the product-limit estimate of contact survival from contacts whose beginning was observed.
 
-    Contacts present at the first frame are excluded: their age is unknown, and long contacts are
-    overrepresented.
+    Contacts of the first frame are excluded, as their age is unknown.
     """
     followed, points = found.followed, np.flatnonzero(found.seen)
     at_risk = np.cumsum(followed[::-1])[::-1][points]
@@ -114,9 +113,9 @@ def survival(found: Durations) -> Survival:
 
 
 def mean_by_rate(found: Durations) -> tuple[float, float]:
-    """Return total contact time per contact end, in frames, and its standard error; inf if no contact ended.
+    """Return contact time per contact end (frames), and its error. inf if no contact ended.
 
-    The standard error is valid for independent contact ends; repeated crossings make the true error larger.
+    The standard error assumes independent contact ends. Repeated crossings make it too small.
     """
     if not found.leaves:
         return float("inf"), float("nan")
@@ -125,10 +124,10 @@ def mean_by_rate(found: Durations) -> tuple[float, float]:
 
 
 def residence(found: Durations, pairs: Int[np.ndarray, "frames"]) -> Float[np.ndarray, "frames"]:
-    """Return, by lag, the fraction of pairs in contact at a frame that stay in contact without a break.
+    """Return, by lag, the fraction of pairs that stay in contact without a break.
 
-    Lags begin at 0. Each fraction is an average over all possible first frames; nan if no pair was inside the
-    cutoff. `pairs` is the number of pairs inside the cutoff at each frame.
+    Lags begin at 0. Each fraction is an average over first frames. nan if there are no pairs. `pairs` is the
+    number of pairs inside the cutoff at each frame.
     """
     count, lags = found.all, np.arange(len(pairs))
     stays = np.cumsum(count[::-1])[::-1]
@@ -140,10 +139,10 @@ def residence(found: Durations, pairs: Int[np.ndarray, "frames"]) -> Float[np.nd
 
 
 def again(stays: Contacts, lags: Int[np.ndarray, "lags"], frames: int) -> tuple[np.ndarray, np.ndarray]:
-    """Count pairs that are in contact at a frame and at a later frame, even if they are apart in between.
+    """Count pairs that are in contact at a frame and at a later frame.
 
-    The first array divided by the second is the residence (see `residence`) with interrupted contacts
-    included. Counts for disjoint subsets of the pairs can be added. Lags are between 0 and frames - 1.
+    The first array divided by the second is the residence with interruptions. Counts for disjoint subsets of
+    the pairs can be added. Lags are between 0 and frames - 1.
 
     Returns:
         two arrays by lag, summed over frames: numbers of pairs inside at both frames, and at the first frame.
@@ -183,7 +182,7 @@ def _new_pairs(stays: Contacts) -> np.ndarray:
 
 @dataclass(frozen=True)
 class Classes:
-    """Classes of atoms: a class index for each atom, and the names of the classes."""
+    """Classes of atoms: the class of each atom, and the class names."""
 
     of: Int[np.ndarray, "atoms"]
     names: Sequence[str]
@@ -197,7 +196,7 @@ class Classes:
 
 @dataclass(frozen=True)
 class Labels:
-    """Classes of atoms by species, residue name and residue; by species only if a file has no residues."""
+    """Classes of atoms by species, residue name and residue."""
 
     species: Classes
     residue_names: Classes | None
@@ -216,7 +215,7 @@ class Labels:
 
 @dataclass(frozen=True)
 class ClassTally(Sums):
-    """Numbers of flips and of frames in contact for each pair of atom classes."""
+    """Numbers of flips and of frames in contact for each class pair."""
 
     _common = ("names",)
 
@@ -228,7 +227,7 @@ class ClassTally(Sums):
 
     @classmethod
     def of(cls, stays: Contacts, classes: Classes, frames: int, directed: bool = False) -> ClassTally:
-        """Count flips and frames in contact by the classes of both atoms, over the given number of frames.
+        """Count flips and frames in contact by the classes of both atoms.
 
         Directed rules count i -> j and j -> i separately. For other rules, the lower class index comes first.
         """
@@ -247,12 +246,12 @@ class ClassTally(Sums):
 
     @property
     def mean_stay(self) -> Float[np.ndarray, "classes classes"]:
-        """Frames in contact divided by contact ends, for each pair of classes; nan if no contact ended."""
+        """Frames in contact per contact end, for each class pair. nan if no contact ended."""
         none = np.full(self.left.shape, np.nan)
         return np.divide(self.exposure, self.left, out=none, where=self.left > 0)
 
     def rows(self) -> list[dict[str, Any]]:
-        """Return table rows for pairs of atom classes with contacts, sorted by descending number of flips."""
+        """Return table rows for class pairs with contacts, most flips first."""
         stay = self.mean_stay
         rows = [
             {
@@ -266,7 +265,7 @@ class ClassTally(Sums):
 
 @dataclass(frozen=True)
 class Chatter(Sums):
-    """Histograms of the time between a flip and the reverse flip of the same pair."""
+    """Histograms of the time between a flip and its reversal."""
 
     inside: Int[np.ndarray, "lengths"]  # visits inside by their length in frames, 0 to the window
     outside: Int[np.ndarray, "lengths"]  # excursions outside by their length
@@ -274,7 +273,7 @@ class Chatter(Sums):
 
     @classmethod
     def of(cls, history: History, window: int) -> Chatter:
-        """Count the flips that are reversed by a later flip of the same pair within `window` frames."""
+        """Count flips that are reversed within `window` frames."""
         pair = history.pair
         same = pair[1:] == pair[:-1]
         apart, from_inside = np.diff(history.frame)[same], history.entered[:-1][same]
@@ -321,13 +320,13 @@ class Busiest(Columns):
         return self[order]
 
     def __add__(self, other: Busiest) -> Busiest:
-        """Return the pairs with the most flips from two tables that have no pair in common."""
+        """Return the pairs with the most flips from two tables without common pairs."""
         return Busiest.concatenate([self, other]).first()
 
 
 @dataclass(frozen=True)
 class Residues(Sums):
-    """Number of flips for each group of atoms (such as a residue): within the group, and with other atoms."""
+    """Flips of each group of atoms (such as a residue): within it, and with others."""
 
     between: Int[np.ndarray, "groups"]
     within: Int[np.ndarray, "groups"]
@@ -347,7 +346,7 @@ class Residues(Sums):
 
 @dataclass(frozen=True)
 class AgainSums(Sums):
-    """Counts of pairs in contact at two frames (see `again`), summed over a sample of the contacts."""
+    """Counts of pairs in contact at two frames (see `again`)."""
 
     both: Int[np.ndarray, "lags"]
     once: Int[np.ndarray, "lags"]
@@ -374,10 +373,10 @@ class Statistics(Sums):
     def of(
         cls, history: History, labels: Labels, directed: bool, window: int, before: Statistics | None = None
     ) -> tuple[Statistics, Contacts]:
-        """Add the statistics of pairs in `history` to `before`; return the sum and the contacts in `history`.
+        """Add statistics of `history` to `before`. Return the sum and the contacts.
 
-        A flip reversed within `window` frames is counted as chatter. A contact with an absence of up to
-        `window` frames counts as one intermittent contact.
+        A flip reversed within `window` frames is counted as chatter. A contact with a gap of up to `window`
+        frames counts as one.
         """
         frames, stays = history.frames, contacts(history)
         named, residues = labels.residue_names, labels.residues
@@ -405,7 +404,7 @@ class Statistics(Sums):
         return counted if before is None else before + counted, stays
 
     def curves(self, pairs: Int[np.ndarray, "frames"], interval: float) -> dict[str, np.ndarray]:
-        """Return survival and residence by lag as table columns; `pairs` counts contacts at each frame.
+        """Return survival and residence by lag. `pairs` counts contacts at each frame.
 
         `interval` is the time between frames, nan if unknown.
         """
@@ -428,7 +427,7 @@ class Statistics(Sums):
 
 @dataclass(frozen=True)
 class Lifetime:
-    """Median, mean and other measures of contact lifetimes, in frames; None for measures that are unknown."""
+    """Measures of contact lifetimes, in frames. Unknown measures are None."""
 
     followed: int  # contacts seen to begin
     median: int | None  # frames after which so many are over
@@ -453,7 +452,7 @@ class Lifetime:
 
 
 def lags_of(frames: int) -> Int[np.ndarray, "lags"]:
-    """Return lags of correlation functions, in frames: consecutive at first, then at increasing spacing."""
+    """Return lags of correlation functions, in frames, with increasing spacing."""
     if frames < 2:
         return np.zeros(1, np.int64)
     return np.unique(np.concatenate([[0], np.round(np.geomspace(1, frames - 1, _POINTS))]).astype(np.int64))

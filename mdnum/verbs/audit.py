@@ -1,8 +1,8 @@
-"""`mdnum audit`: tests to find out whether an ASE calculator is safe to run and to differentiate.
+"""`mdnum audit`: tests whether an ASE calculator is safe to use.
 
-The checks of `mdnum.audit.checks.CHECKS` run in order, and each result is saved in the output folder. If an
-audit is interrupted, the completed results are in the folder, and the remaining checks can be run later. A
-check returns the code of each finding and the values in its text; audit.toml contains the texts.
+The checks of `mdnum.audit.checks.CHECKS` run in order. Each result is saved. An interrupted audit can be
+continued with the remaining checks. A check returns codes and values of findings. audit.toml contains the
+texts.
 """
 
 from __future__ import annotations
@@ -62,9 +62,8 @@ def audit(
 ) -> Outcome:
     """Test whether a calculator is safe to run and to differentiate.
 
-    The number of calls of the calculator is limited, whatever the calculator's speed: about 6,000 calls for
-    one element, and at most 12,000. Calls of the calculator that are needed for a verdict come first. If an
-    audit is interrupted, the results of the completed checks are in its folder.
+    About 6,000 calculator calls are made for one element, at most 12,000. Calls of the calculator that are
+    needed for a verdict come first. An interrupted audit keeps the results of completed checks.
 
     Example:
         >>> mdnum.audit_calculator(ase.calculators.emt.EMT(), "copper.xyz").verdict
@@ -147,7 +146,7 @@ def _ask_all(
     report: bool,
     progress: Progress | None,
 ) -> Outcome:
-    """Run the remaining checks, save the result of each check, and write the summary and the report."""
+    """Run the remaining checks, save each result, and write the report."""
     from mdnum.audit.subject import CalculatorSubject
     from mdnum.audit.thresholds import find_thresholds
     from mdnum.deadline import interrupting
@@ -220,9 +219,9 @@ def _ask_all(
 def answer_of(
     check: AuditCheck, subject: CalculatorSubject, log: frame.Progress, before: Iterable[CheckResult]
 ) -> CheckResult:
-    """Run a check and return its result; if the calculator fails, the result is a finding about the failure.
+    """Run a check and return its result. A failing calculator is a finding.
 
-    If the calculator gave different results for the same input, a finding is added, once per audit.
+    Different results for the same input are reported once per audit.
     """
     named: dict[str, Any] = {"name": check.name, "title": check.title}
     rest = f"the rest of {check.name}"
@@ -243,7 +242,7 @@ def answer_of(
 
 
 def _keep_evidence(folder: RunFolder, loaded: LoadedCalculator, check: AuditCheck) -> None:
-    """Write structures in full precision, and a script that reproduces a finding without mdnum."""
+    """Write structures in full precision, and a script that needs no mdnum."""
     from mdnum.audit.record import STRUCTURES, script
 
     _write_structures(folder, check.structures)
@@ -288,7 +287,7 @@ def _loaded(calculator: str | Callable[[], Any]) -> LoadedCalculator:
 
 
 def _same(calculator: str | Callable[[], Any] | None, state: AuditState, path: Path) -> LoadedCalculator:
-    """Return the calculator of an audit to resume; raise an error if another calculator was given."""
+    """Return the calculator of an audit to resume. Raise an error for another one."""
     if calculator is None and not state.named:
         raise InputError(
             "the calculator of the stored audit was a Python object, which is not stored in the folder",
@@ -318,7 +317,7 @@ def _structure(structure: Atoms | str | Path | None, loaded: LoadedCalculator, d
 
 
 def _internal(timestep: float | None, given: units.Units) -> float | None:
-    """Convert a time step from fs (τ for reduced units) to the unit length * sqrt(mass / energy)."""
+    """Convert a time step from fs (or τ) to length * sqrt(mass / energy)."""
     if timestep is None:
         return None
     if not timestep > 0:
@@ -367,7 +366,7 @@ def _summary(state: AuditState) -> dict[str, Any]:
 
 
 def _tables(state: AuditState) -> dict[str, dict[str, np.ndarray]]:
-    """Return the audit's tables: the data points of the figures, and the data that the checks recorded."""
+    """Return the audit's tables: points of figures, and data of checks."""
     lines = [
         (result.name, f"{result.name}-{place}", label, chart.x, values)
         for result in state.shown
@@ -383,7 +382,7 @@ def _tables(state: AuditState) -> dict[str, dict[str, np.ndarray]]:
 
 
 def _named(value: Any, given: units.Units) -> Any:
-    """Return the results of a check, with each placeholder for a unit replaced by the unit's name."""
+    """Return the results of a check, with the names of units."""
     if isinstance(value, units.Measured):
         return value.to("", vars(given))
     if isinstance(value, str):
@@ -401,7 +400,7 @@ def _named(value: Any, given: units.Units) -> Any:
 
 
 def _by_cause(found: Sequence[Observed]) -> list[tuple[Observed, list[Observed]]]:
-    """Group findings by cause: return each main finding with a list of the findings that it may explain."""
+    """Return each main finding with the findings that it may explain."""
     above = heads([(one.code, one.severity) for one in found])
     return [
         (one, [other for k, other in enumerate(found) if k != place and above[k] == place])
@@ -411,7 +410,7 @@ def _by_cause(found: Sequence[Observed]) -> list[tuple[Observed, list[Observed]]
 
 
 def _finding(one: Observed, section: str, cause: str, texts: Texts = TEXTS) -> Finding:
-    """Return a finding with its sentences, from audit.toml or from the package that defines the check."""
+    """Return a finding with its sentences, from audit.toml or the check's package."""
     if one.code not in TEXTS.entries:
         given = {name: str(one.values.get(name, "")) for name in ("title", "text", "remedy")}
         return Finding(one.code, one.severity, **given, values=one.values, section=section, cause=cause)
@@ -544,7 +543,7 @@ def _ways(part: Mapping[str, Any]) -> str:
 
 
 def _marked(rows: Sequence[Mapping[str, Any]], title: str) -> Any:
-    """Format a table of tests, with the rows of failed tests at the top."""
+    """Format a table of tests. Failed tests come first."""
     order = sorted(rows, key=lambda row: not any(value is False for value in row.values()))
     bad = frozenset(n for n, row in enumerate(order) if any(value is False for value in row.values()))
     return replace(records(order, title, shown=8), bad=bad)

@@ -40,7 +40,7 @@ def bounce(
     against: Sequence[str | Mapping[str, Any]] = (),
     **keep: Unpack[Keep],
 ) -> Outcome:
-    """Simulate a bouncing ball and its variants, record contacts and solver stops, and write a report.
+    """Simulate a bouncing ball and its variants, and write a report.
 
     Example:
         >>> mdnum.bounce("ball/drop", against=["precision.state=float32"])
@@ -70,7 +70,7 @@ def bounce(
 
 
 def command(system: str | None = None, *, demo: str | None = None, **given: Any) -> Outcome | Reply:
-    """Execute `mdnum ball`: run a system or a demonstration; without a name, list the names of both.
+    """Execute `mdnum ball` for a system or demonstration. Without a name, list both.
 
     Raises:
         InputError: a demonstration was requested together with options of a ball.
@@ -115,7 +115,7 @@ def _loaded(
 
 
 def _simulate(problem: BallProblem, progress: Progress | None) -> tuple[BallRun, float | None]:
-    """Simulate a ball; return the run, and its speed in steps per second (None for a short run)."""
+    """Simulate a ball. Return the run, and its steps per second (None for short runs)."""
     marks: list[tuple[float, int]] = []
 
     def rate() -> float | None:
@@ -143,7 +143,7 @@ def _simulate(problem: BallProblem, progress: Progress | None) -> tuple[BallRun,
 def _differentiated(
     simulation: BallSimulation, run: BallRun, progress: Progress | None
 ) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
-    """Return summary entries (loss, derivatives, variants) and a table of height differences of variants."""
+    """Return loss, derivatives and variants, and a table of height differences."""
     from mdnum.ball.rollout import first_difference
     from mdnum.verbs import ball_record
 
@@ -172,7 +172,7 @@ def _differentiated(
 
 
 def gradients(problem: BallProblem, asked: Any, first: bool = False) -> list[dict[str, Any]]:
-    """Return the derivatives by each requested method, as one mapping of plain values per method.
+    """Return the derivatives by each requested method, as plain values.
 
     Args:
         asked: the [gradient] table.
@@ -199,7 +199,7 @@ def gradients(problem: BallProblem, asked: Any, first: bool = False) -> list[dic
 
 
 def loss(problem: BallProblem, gradient: Sequence[Mapping[str, Any]]) -> float:
-    """Return the loss of the run, from a gradient method if one has already run the same program."""
+    """Return the loss. A gradient method may have computed it already."""
     same = ("unrolled", "frozen", "event-aware")
     known = [made["value"] for made in gradient if made["method"] in same and not made["refused"]]
     return known[0] if known else problem.value()
@@ -209,7 +209,7 @@ def loss(problem: BallProblem, gradient: Sequence[Mapping[str, Any]]) -> float:
 
 
 def judge(view: BallView) -> Verdict:
-    """Return findings on a ball's run, and evidence that the run is correct, from the run's folder alone."""
+    """Return findings on a ball's run, and evidence that it is correct."""
     summary = view.summary
     rules = (
         _finite, _ledger, _finite_gradient, _independent, _ambiguous, _cap, _disagree, _forks, _iterations,
@@ -250,7 +250,7 @@ def _evidence(view: BallView, codes: set[str]) -> Iterator[str]:
 
 
 def differs(first: float | None, second: float | None) -> bool:
-    """True if two derivatives differ by more than one percent of the larger one, or if either is None."""
+    """True if two derivatives differ by more than one percent, or if one is None."""
     if first is None or second is None:
         return first is not second
     return abs(first - second) > _DISAGREE * max(abs(first), abs(second))
@@ -410,7 +410,7 @@ def _iterations(view: BallView) -> Iterator[Finding]:
 
 
 def _remarks(view: BallView) -> Iterator[Finding]:
-    """Yield findings on settings of the system file that are valid but probably not intended."""
+    """Yield findings on valid settings that are probably not intended."""
     from pydantic import ValidationError
 
     from mdnum.systems.ball import BallSpec, remarks

@@ -1,4 +1,4 @@
-"""Content of the folder of a ball's run: tables of decisions, summary, and differences from closed forms."""
+"""Content of a ball's folder: tables, summary, and differences from closed forms."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ def tables(run: BallRun) -> dict[str, dict[str, np.ndarray]]:
 
 
 def steps(run: BallRun) -> dict[str, np.ndarray]:
-    """Return a table with one row per step: contacts, flips, stop reasons, margins, mean height, energy."""
+    """Return a table of contacts, flips, margins, height and energy by step."""
     entered, left = run.contacts.counts(run.steps)
     inside = run.contact.sum(axis=1)
     first = inside[0] - entered[1] + left[1]
@@ -52,7 +52,7 @@ def steps(run: BallRun) -> dict[str, np.ndarray]:
 
 
 def ranges(run: BallRun) -> dict[str, np.ndarray]:
-    """Largest and smallest magnitude of heights, velocities, depths and penalty forces at each step."""
+    """Smallest and largest magnitude of heights, velocities, depths and forces by step."""
     if not run.kept:
         return {}
     y, v = run.y.astype(np.float64), run.v.astype(np.float64)
@@ -64,7 +64,7 @@ def ranges(run: BallRun) -> dict[str, np.ndarray]:
 
 
 def contacts(run: BallRun) -> dict[str, np.ndarray]:
-    """Return a table with one row per contact flip (begin or end of a contact)."""
+    """Return a table of contact flips (begin or end of a contact)."""
     flips = run.contacts
     lift = 0.0 if run.world.lift is None else float(run.world.lift)
     return {
@@ -75,10 +75,10 @@ def contacts(run: BallRun) -> dict[str, np.ndarray]:
 
 
 def decisions(run: BallRun) -> dict[str, np.ndarray]:
-    """Return a table with one row per stop decision of the solver, for all steps that needed the solver.
+    """Return a table of the solver's stop decisions.
 
-    All decisions are included if one solver handles all balls and residual histories were kept. Otherwise,
-    the table contains only the last two decisions of each call of the solver.
+    All decisions are included for one solver with residual histories. Otherwise, only the last two decisions
+    of each call are included.
     """
     rule = rule_of(run)
     if rule is None:
@@ -130,7 +130,7 @@ def _histories(run: BallRun, rule: Any, busy: np.ndarray) -> dict[str, np.ndarra
 
 
 def heights(run: BallRun) -> dict[str, np.ndarray]:
-    """Return a table of height and velocity, at every step, of the first `FOLLOWED` balls."""
+    """Return a table of height and velocity of the first `FOLLOWED` balls."""
     count = min(run.balls, FOLLOWED)
     shape = (run.steps + 1, count)
     return {
@@ -142,7 +142,7 @@ def heights(run: BallRun) -> dict[str, np.ndarray]:
 
 
 def separations(name: str, found: BallDifference) -> dict[str, np.ndarray]:
-    """Return a table with the largest height difference between a variant and the main run at each step."""
+    """Return a table of the largest height difference from the main run by step."""
     size = len(found.separation)
     return {"variant": np.full(size, name), "step": np.arange(size), "separation": found.separation}
 
@@ -151,7 +151,7 @@ def separations(name: str, found: BallDifference) -> dict[str, np.ndarray]:
 
 
 def summarize(simulation: BallSimulation, run: BallRun) -> dict[str, Any]:
-    """Return the content of summary.json of a ball's run: sizes, counts, margins and status."""
+    """Return summary.json of a ball's run: sizes, counts, margins and status."""
     spec = simulation.system.spec
     entered = int(run.contacts.entered.sum())
     busy = solved(run)
@@ -182,7 +182,7 @@ def compared(
     gradient: Sequence[Mapping[str, Any]],
     theirs: Sequence[Mapping[str, Any]],
 ) -> dict[str, Any]:
-    """Return the step and decision at which a variant and the run diverge, and the variant's gradient.
+    """Return where a variant and the run diverge, and the variant's gradient.
 
     Args:
         found: the difference between the two runs.
@@ -204,10 +204,10 @@ def compared(
 
 
 def exact(system: BallSystem, run: BallRun, gradient: Sequence[Mapping[str, Any]]) -> dict[str, Any] | None:
-    """Return the run's deviations from the closed form, or None if no closed form exists.
+    """Return the run's deviations from the closed form. None if there is none.
 
-    A closed form exists if the ball starts above the floor and the acceleration is constant and downward. The
-    contact must be an impact, a projection or a sharp penalty (a spring).
+    The ball must start above the floor and accelerate downward at a constant rate. The contact must be an
+    impact, a projection or a sharp penalty (a spring).
 
     Args:
         gradient: derivatives by each method; they are compared if the loss is a height.
@@ -266,7 +266,7 @@ def exact(system: BallSystem, run: BallRun, gradient: Sequence[Mapping[str, Any]
 
 
 def rule_of(run: BallRun) -> Any:
-    """Return the stopping rule of this run's solver, or None if the run has no solver."""
+    """Return the stopping rule of the solver. None if there is no solver."""
     contact = run.world.contact
     if isinstance(contact, Projection):
         return contact.stop
@@ -274,7 +274,7 @@ def rule_of(run: BallRun) -> Any:
 
 
 def solved(run: BallRun) -> np.ndarray:
-    """True for each step (and each ball, if balls are solved separately) at which the solver was needed."""
+    """True for each step at which the solver was needed. By ball if balls are solved separately."""
     if rule_of(run) is None:
         return run.reason != Reason.NONE.value
     if isinstance(run.world.contact, Penalty):
@@ -284,12 +284,12 @@ def solved(run: BallRun) -> np.ndarray:
 
 
 def ambiguous_flips(run: BallRun) -> np.ndarray:
-    """True for contact flips whose margin is at most the rounding bound, if this bound is not zero."""
+    """True for contact flips whose margin is within a nonzero rounding bound."""
     return run.contacts.ambiguous & (run.contacts.bound > 0)
 
 
 def ambiguous_stops(run: BallRun) -> np.ndarray:
-    """Count the stop decisions of each step that may change with the order of summation in the residual."""
+    """Count stop decisions that may depend on the order of summation, by step."""
     rule = rule_of(run)
     if rule is None or isinstance(rule, FixedCount):
         return np.zeros(run.steps, np.int64)
@@ -303,7 +303,7 @@ def ambiguous_stops(run: BallRun) -> np.ndarray:
 
 
 def _of_batch(run: BallRun) -> tuple[np.ndarray, np.ndarray]:
-    """Residual and stop margin of each step; for separate solvers, of the ball with smallest |margin|."""
+    """Residual and stop margin of each step. With separate solvers, those of the smallest |margin|."""
     residual, margin = run.residual.astype(np.float64), run.margin.astype(np.float64)
     if residual.ndim == 1:
         return residual, margin

@@ -1,4 +1,4 @@
-"""Statistics and findings on neighbor lists and energies that a user's simulation loop recorded."""
+"""Statistics and findings on neighbor lists and energies of a recorded loop."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ _POINTS = 2_000
 
 
 def loop_told(folder: RunFolder) -> dict[str, Any]:
-    """Return statistics of a loop's neighbor lists and energy; None for a quantity not recorded."""
+    """Return statistics of neighbor lists and energy. None if not recorded."""
     loop = folder.read("loop")
     return {"lists": _lists_told(loop, folder), "energy": _energy_told(loop, folder)}
 
@@ -53,7 +53,7 @@ def _lists_told(loop: Mapping[str, np.ndarray], folder: RunFolder) -> dict[str, 
 
 
 def _energy_told(loop: Mapping[str, np.ndarray], folder: RunFolder) -> dict[str, Any] | None:
-    """Return statistics of the recorded energy, such as the fraction of its variance due to flips."""
+    """Return statistics of the energy, such as the variance due to flips."""
     energy = loop["energy"]
     if len(energy) < 4 or not np.isfinite(energy).all():
         return None
@@ -81,7 +81,7 @@ def _energy_told(loop: Mapping[str, np.ndarray], folder: RunFolder) -> dict[str,
 def findings(
     view: FlipsView, lists: Mapping[str, Any] | None, energy: Mapping[str, Any] | None
 ) -> Iterator[Finding]:
-    """Yield findings on pairs missing from neighbor lists, on list overflow, and on energy jumps."""
+    """Yield findings on missing pairs, list overflow, and energy jumps."""
     if lists and (worst := lists["worst"]) is not None:
         values = {"pair": f"{worst['i']}–{worst['j']}", "missed": worst["frames"]}
         again, deepest = ["again"] * (lists["times"] > lists["lost"]), view.length(worst["deepest"])
@@ -98,7 +98,7 @@ def findings(
 
 
 def sections(view: FlipsView) -> Iterator[Section]:
-    """Yield a section on recorded neighbor lists and a section on recorded energies, if there are any."""
+    """Yield sections on recorded neighbor lists and energies."""
     rows, energy = view.table("loop"), view.summary.get("energy")
     some = slice(None, None, -(-len(rows["number"]) // _POINTS) or 1)
     drawn = {"lists": {"pairs lost": rows["lost"].astype(float)}, "energy": {"energy": rows["energy"]}}
@@ -111,7 +111,7 @@ def sections(view: FlipsView) -> Iterator[Section]:
 
 
 def unfinished(view: FlipsView) -> Verdict:
-    """Return the verdict on a simulation loop that ended before its recorder was closed."""
+    """Return the verdict on a loop that ended with an open recorder."""
     frames, one = view.table("frames"), view.summary["rules"][0]
     number, entered, left = (frames[name][frames["rule"] == 0] for name in ("number", "entered", "left"))
     flips, last = int((entered + left).sum()), int(number[-1])

@@ -1,4 +1,4 @@
-"""Findings, sections and figures on the flips of a trajectory, made from the output folder alone."""
+"""Findings, sections and figures on flips, made from the output folder alone."""
 
 from __future__ import annotations
 
@@ -105,7 +105,7 @@ def _ended(view: FlipsView) -> Iterator[Finding]:
 
 
 def _disagreeing(view: FlipsView, place: int) -> np.ndarray:
-    """Return frames whose pair count is not the previous count plus pairs entered minus pairs left."""
+    """Return frames where the pair count does not equal the previous count plus flips."""
     table = view.table("frames")
     rows = table["rule"] == place
     net = (table["entered"][rows] - table["left"][rows])[1:]
@@ -129,7 +129,7 @@ def _of_rules(view: FlipsView) -> Iterator[Finding]:
 
 
 def _limits(view: FlipsView, place: int, one: Rule) -> Iterator[Limit]:
-    """Yield findings (code, text variants, values) on the limits of an analysis with one neighbor rule."""
+    """Yield findings (code, text variants, values) on the limits of an analysis."""
     if len(wrong := _disagreeing(view, place)):
         yield "EVENT_ALGEBRA", (), {"first": int(wrong[0]) + 1, "frames": len(wrong)}
     flips, frames = one["flips"], view.summary["frames"]
@@ -165,7 +165,7 @@ def _undecided(one: Rule) -> Iterator[Limit]:
 
 
 def _far_apart(one: Rule) -> bool:
-    """True if frames are too far apart: the median lifetime of contacts is one frame."""
+    """True if frames are too far apart: the median contact lasts one frame."""
     return one["flips"] >= FEW and one["lifetime"]["median"] == 1
 
 
@@ -263,7 +263,7 @@ def _time_goes_back(view: FlipsView) -> Finding:
 
 
 def _title(title: str, view: FlipsView, one: Rule) -> str:
-    """Return the title of a section on a neighbor rule, with the rule itself if there are several rules."""
+    """Return the title of a section. It names the rule if there are several."""
     return f"{title}, {view.rule(one)}" if len(view.summary["rules"]) > 1 else title
 
 
@@ -307,7 +307,7 @@ def _input(view: FlipsView, size: str) -> list[tuple[str, str]]:
 
 
 def _across(view: FlipsView, across: Mapping[str, Any]) -> Section:
-    """Return a section on jumps of atoms across cell faces, and on diffusion before and after unwrapping."""
+    """Return a section on jumps of atoms across cell faces, and on diffusion."""
     diffusion, time = across["diffusion"] or {}, view.summary["time"]
     values = {"raw": None, "undone": None, "error": None, **across, **diffusion}
     values["too_far"] = TEXTS("too_far") if across["too_far"] else None
@@ -414,7 +414,7 @@ def _classes(view: FlipsView, title: str, rows: list[Mapping[str, Any]]) -> Tabl
 
 
 def _busiest(view: FlipsView) -> Browse | None:
-    """Return the pairs with the largest number of flips; None if no pair flipped."""
+    """Return the pairs with the most flips. None if no pair flipped."""
     table, rules = view.table("busiest"), view.summary["rules"]
     if not len(table["i"]):
         return None
@@ -430,7 +430,7 @@ def _busiest(view: FlipsView) -> Browse | None:
 
 
 def _plots(view: FlipsView, place: int, one: Rule) -> Iterator[tuple[str, Plot]]:
-    """Yield the figures of one neighbor rule, each with its section's title; empty figures are omitted."""
+    """Yield the figures of a neighbor rule with section titles. Empty figures are omitted."""
 
     def rows(table: str) -> dict[str, np.ndarray]:
         whole = view.table(table)
@@ -498,7 +498,7 @@ def _plots(view: FlipsView, place: int, one: Rule) -> Iterator[tuple[str, Plot]]
 
 
 def _lasting(view: FlipsView, place: int) -> Table | None:
-    """Return the pairs of residues with the longest total contact time; None if there was no contact."""
+    """Return the residue pairs with the longest contact time. None without contacts."""
     table, frames = view.table("occupancy"), view.summary["frames"]
     rows = np.flatnonzero(table["rule"] == place)
     # those throughout are most often neighbors along a chain
@@ -514,7 +514,7 @@ def _lasting(view: FlipsView, place: int) -> Table | None:
 def _maps(
     view: FlipsView, pairs: Mapping[str, np.ndarray], moments: Mapping[str, np.ndarray], x: np.ndarray
 ) -> Iterator[tuple[str, tuple[str, ...], tuple[str, ...], Region]]:
-    """Yield the contact matrix, and a map of each residue's contacts over time, both with axis labels."""
+    """Yield the contact matrix, and contacts of residues over time, with axis labels."""
     index, first = np.unique(moments["index"], return_index=True)
     if not len(index):
         return

@@ -1,4 +1,4 @@
-"""Findings on two runs that diverge, and the verdict in one sentence, from the output folder alone."""
+"""Findings and verdict on two runs that diverge, from the output folder."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ RANKING = "Ranking"
 
 
 def subject(s: Mapping[str, Any]) -> str:
-    """Return a phrase for the decision that differs: a pair's flip, a ball's contact or a solver's stop."""
+    """Return a phrase for a decision: a pair's flip, a contact or a stop."""
     d = s.get("decision")
     if d is None:
         return ""
@@ -36,7 +36,7 @@ def subject(s: Mapping[str, Any]) -> str:
 
 
 def of_pair(flip: Mapping[str, Any]) -> str:
-    """Return the label of a flip: its ball, or its pair and (if there are several) its energy term."""
+    """Return the label of a flip: its ball, or its pair and energy term."""
     i, *j = flip["subject"]
     return pair_name({"i": i, "j": j[0], "terms": flip["terms"]}) if j else str(i)
 
@@ -76,7 +76,7 @@ def _headline(view: View) -> tuple[str, dict[str, Any]]:
 
 
 def agreeing(view: View) -> str:
-    """Return a phrase on how many repeats of run B split later if the decisions of run A are imposed."""
+    """Return a phrase on how many repeats split later with imposed decisions."""
     said: list[str] = []
     for name in ("count", "count_other"):
         if count := view.summary.get(name):
@@ -114,7 +114,7 @@ def decided(decision: Mapping[str, Any]) -> str:
 
 
 def sides(decision: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the values of a decision in runs A and B, and the name of the run in which it is true."""
+    """Return a decision in runs A and B, and the run in which it is true."""
     yes = "A" if decision["decided"]["A"] > decision["decided"]["B"] else "B"
     return {"yes": yes, "no": "B" if yes == "A" else "A", "a": decision["decided"]["A"],
             "b": decision["decided"]["B"]}  # fmt: skip
@@ -158,13 +158,13 @@ def _findings(view: View) -> Iterator[Finding]:
 
 
 def must_hold(row: Mapping[str, Any]) -> Finding:
-    """Return the finding on a numerical choice that should not change any bit of the results, but did."""
+    """Return the finding on a choice that should not change bits, but did."""
     values: dict[str, Any] = {name: row.get(name) for name in ("choice", "difference", "first_bit", "fork")}
     return TEXTS.finding("MUST_HOLD_FORKED", *["fork"] * (row.get("fork") is not None), **values)
 
 
 def judge_screen(view: View) -> Verdict:
-    """Return the verdict on all choices: the first that changes a decision, and unexpected bit changes."""
+    """Return the verdict on all choices."""
     rows, found = view.summary["ranking"], []
     broken = [row for row in rows if row["must_hold"] and row["first_bit"] is not None]
     forked = [row for row in rows if row["fork"] is not None]
@@ -181,7 +181,7 @@ def judge_screen(view: View) -> Verdict:
 
 
 def judge_compare(view: View) -> Verdict:
-    """Return the verdict on the runs of two folders: the step of divergence, and its possible causes."""
+    """Return the verdict on two folders: the step of divergence and its causes."""
     summary = view.summary
     causes = summary["causes"]
     values = {name: summary[name] for name in ("steps", "first_bit", "fork")}
@@ -210,7 +210,7 @@ def judge_compare(view: View) -> Verdict:
 
 
 def judge_benign(view: View) -> Verdict:
-    """Return the verdict on whether repeats of run B are consistent with the ensemble of repeats of run A."""
+    """Return the verdict on whether repeats of runs A and B are consistent."""
     summary = view.summary
     values = {"difference": summary["difference"], "step": summary["window"]}
     if summary["passed"]:

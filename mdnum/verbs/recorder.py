@@ -1,4 +1,4 @@
-"""`mdnum.Recorder`: records the flips of any simulation loop in a folder, as `mdnum flips` does."""
+"""`mdnum.Recorder`: records the flips of any simulation loop in a folder."""
 
 from __future__ import annotations
 
@@ -32,11 +32,10 @@ _NONE = {name: np.zeros(0, np.int64) for name in ("rule", "i", "j", "rank", "ent
 
 
 class Recorder:
-    """Recorder of flips, and of pairs that are missing from the neighbor list, for any simulation loop.
+    """Recorder of flips and of missing neighbors, for any simulation loop.
 
-    The results are the same as from `mdnum.flips` for a file with the recorded frames. Decisions (pair inside
-    or outside the cutoff) are computed from the positions in float64. Decisions that are uncertain because
-    positions were rounded to float32 are marked.
+    The results are those of `mdnum.flips` for a file of these frames. Pair decisions are computed from the
+    positions in float64. Decisions that are uncertain because positions were rounded to float32 are marked.
 
     Example:
         >>> with mdnum.Recorder(8.5, box=box, fractional=True, out="runs/mine") as rec:
@@ -110,7 +109,7 @@ class Recorder:
         self, step: int, positions: Any, cell: Any = None, *, box: Any = None, pbc: Any = None,
         neighbors: Any = None, velocities: Any = None, energy: Any = None,
     ) -> None:  # fmt: skip
-        """Record one frame; arrays may be numpy, jax or torch arrays, and are copied.
+        """Record one frame. Arrays (numpy, jax or torch) are copied.
 
         Args:
             step: step of the loop.
@@ -143,7 +142,7 @@ class Recorder:
     def see_many(
         self, positions: Any, cell: Any = None, *, first: int = 0, every: int = 1, **given: Any
     ) -> None:
-        """Record several frames: an array (frames, atoms, 3), a list of arrays, or a list of ASE `Atoms`.
+        """Record several frames: an array (frames, atoms, 3), or a list of arrays or `Atoms`.
 
         Args:
             first, every: step of the first frame, and number of steps between frames.
@@ -157,7 +156,7 @@ class Recorder:
                 self.see(first + every * k, frame, **here)
 
     def see_atoms(self, atoms: Any, step: int | None = None) -> None:
-        """Record ASE `Atoms`, or the atoms and the step number of an ASE dynamics object."""
+        """Record ASE `Atoms`, or the present state of an ASE dynamics object."""
         step = int(getattr(atoms, "nsteps", self._given if step is None else step))
         atoms = getattr(atoms, "atoms", atoms)
         if self._source.named is None:
@@ -178,7 +177,7 @@ class Recorder:
             )
 
     def hook(self, step: Any, positions: Any, **given: Any) -> None:
-        """Record a frame inside jax.jit, fori_loop or scan, by a callback to the host at every step."""
+        """Record a frame inside jax.jit, fori_loop or scan, by a host callback."""
         from jax.experimental import io_callback
 
         def seen(step: Any, positions: Any, given: Mapping[str, Any]) -> None:
@@ -233,7 +232,7 @@ class Recorder:
         return self._outcome
 
     def compare(self, other: Recorder) -> FolderFork:
-        """Find the first frame at which neighbor sets of two recorded loops differ; close both recorders."""
+        """Find the first frame at which two loops differ. Close both recorders."""
         from mdnum.forks.folders import compare_folders
 
         return compare_folders(self.outcome.path, other.outcome.path)
@@ -273,7 +272,7 @@ class Recorder:
             self._cost = self._written - now
 
     def _after(self, one: FrameExamination, new: Sequence[dict[str, Any]]) -> None:
-        """Record a frame's energy, and pairs inside the cutoff that are missing from its neighbor list."""
+        """Record a frame's energy, and pairs that its neighbor list lacks."""
         energy, listed, overflow = self._told.popleft()
         flips, frame = next((rows for rows in new if rows["rule"][0] == 0), _NONE), self._source.now
         for rows in new:

@@ -1,4 +1,4 @@
-"""Computation of the points of a sweep by a worker process of `mdnum sweep`."""
+"""Computation of the points of a sweep by a worker process."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ _SERIES = "series.parquet"
 
 @dataclass(frozen=True)
 class Task:
-    """Points of a sweep that one process computes in sequence, so that compiled programs can be reused."""
+    """Points of a sweep that one process computes in sequence."""
 
     workspace: str
     points: tuple[Mapping[str, Any], ...]  # each with address, state and settings
@@ -33,7 +33,7 @@ class Task:
 
 
 def enough(result: Mapping[str, Any] | None, measures: Mapping[str, str]) -> bool:
-    """True if a stored result is complete, or if the computation failed for a reason that will persist."""
+    """True if a result is complete, or would fail again."""
     if result is None:
         return False
     if result["status"] == "failed":
@@ -43,16 +43,16 @@ def enough(result: Mapping[str, Any] | None, measures: Mapping[str, str]) -> boo
 
 
 def _missing(result: Mapping[str, Any] | None, measures: Mapping[str, str]) -> list[str]:
-    """Return the requested measures that are not stored, or were computed by different source code."""
+    """Return the measures that are not stored, or are from other source code."""
     stored = {} if result is None else result["measures"]
     return [name for name, at in measures.items() if stored.get(name, {}).get("digest") != at]
 
 
 def work(task: Task) -> list[dict[str, Any]]:
-    """Compute the missing points of a task; return the address and the status of each point.
+    """Compute the missing points of a task. Return address and status of each.
 
-    The status of a point is "computed" (now), "there" (already stored), "busy" (being computed by another
-    process), or "full" (its folder cannot be written), with the reason.
+    The status is "computed" (now), "there" (stored before), "busy" (in another process), or "full" (not
+    writable), with the reason.
     """
     place, told = Workspace(Path(task.workspace)), []
     for point in task.points:
@@ -136,7 +136,7 @@ def _run(task: Task, point: Mapping[str, Any], folder: Path) -> Sample:
 
 
 def _bounced(system: Any, steps: int, task: Task, point: Mapping[str, Any], folder: Path) -> Sample:
-    """Simulate a ball without its variants and gradients, and return the data for measures."""
+    """Simulate a ball, and return the data for measures."""
     import pyarrow
     import pyarrow.parquet as parquet
 

@@ -1,6 +1,6 @@
-"""Check the energy drift of a short run at constant energy, and find the causes of the drift.
+"""Check the energy drift of a short NVE run, and find its causes.
 
-Runs use the velocity Verlet algorithm of ASE; molecules of rigid models keep their shape.
+Runs use ASE's velocity Verlet. Molecules of rigid models keep their shape.
 """
 
 from __future__ import annotations
@@ -48,18 +48,18 @@ _SOURCES = ("integrator", "flips", "elsewhere", "rest")
 
 
 class DynamicsCheck(AuditCheck):
-    """Is the energy conserved in a short run at constant energy, and if not, why?
+    """Is the energy conserved in a short run at constant energy?
 
-    The check reports the energy drift, its standard error, and the drifts due to integrator, flips and other
-    causes. The drift that is explained neither by flips nor by the work of the forces is attributed to the
-    integrator. At half the time step, the integrator's drift must fall to a quarter; a second run tests this.
+    The check reports the drift, its standard error, and the drifts due to integrator, flips and other causes.
+    Drift that neither flips nor the work of forces explain is the integrator's. At half the time step, it
+    must fall to a quarter.
     """
 
     name, title, order, basic, calls = "dynamics", "Dynamics", 70, True, 1900
     needed_to = ("run",)
 
     def ask(self, subject: CalculatorSubject, progress: Progress) -> CheckResult:
-        """Run the dynamics with the full and with half the time step, and compute the energy balance."""
+        """Run the dynamics with full and half time step. Compute the energy balance."""
         with subject.meter.limited():
             return self._ask(subject, progress)
 
@@ -113,7 +113,7 @@ class DynamicsCheck(AuditCheck):
 
 
 def _aged(subject: CalculatorSubject, ran: NveRun, count: int, noise: NoiseFloor) -> tuple[float, float]:
-    """Recompute a run's energies with new calculators; return their largest change and its limit, in eV."""
+    """Return the largest change of energies with new calculators, and its limit (eV)."""
     places = np.unique(np.linspace(0, len(ran.potential) - 1, count).astype(int))
     again = [subject.fresh().energy(ran.at(ran.positions[n])) for n in places]
     rounding = NoiseFloor(np.finfo(float).eps * largest(ran.potential), 0.0)
@@ -121,7 +121,7 @@ def _aged(subject: CalculatorSubject, ran: NveRun, count: int, noise: NoiseFloor
 
 
 def _brief(ran: NveRun, stale: tuple[float, float], units: Units) -> CheckResult:
-    """Return the result of a short run that tests whether energies depend on earlier time steps."""
+    """Return whether energies depend on earlier steps, from a short run."""
     (differs, allowed), steps = stale, len(ran.potential) - 1
     change = 1e3 * largest(ran.total - ran.total[0]) / ran.positions.shape[1]
     seen = Measured(differs, "energy", allowed)
@@ -132,7 +132,7 @@ def _brief(ran: NveRun, stale: tuple[float, float], units: Units) -> CheckResult
 
 
 def _limits(subject: CalculatorSubject) -> tuple[list[PairThreshold], str]:
-    """Return the pair thresholds of the calculator, or the reason why no thresholds are known."""
+    """Return the pair thresholds of the calculator, or why none are known."""
     try:
         # one at which no more than a third derivative jumps leaves no trace in a run
         found = [one for one in find_thresholds(subject) if one.order < SMOOTH or one.dies]
@@ -143,7 +143,7 @@ def _limits(subject: CalculatorSubject) -> tuple[list[PairThreshold], str]:
 
 @dataclass(frozen=True)
 class TwoRuns:
-    """Two runs, one with the full and one with half the time step, and their energy balances."""
+    """Two runs with full and half time step, and their energy balances."""
 
     subject: CalculatorSubject
     # whole, half: the run, and the one with half its time step
@@ -158,7 +158,7 @@ class TwoRuns:
     period: float  # of the fastest vibration, internal time
 
     def shares(self) -> dict[str, Drift]:
-        """Energy drift (meV/atom/ps): the total, and the drifts due to flips, integrator and other causes."""
+        """Energy drifts (meV/atom/ps): total, flips, integrator and other causes."""
         one, other = self.whole, self.half
         rest, elsewhere = self.balance.filled, self.balance.elsewhere
         flips = wandering(one.time, self.balance.jumps)
@@ -187,7 +187,7 @@ class TwoRuns:
         return {name: share.times(factor) for name, share in found.items()}
 
     def outcome(self, unknown: str) -> CheckResult:
-        """Return the result of the check; `unknown` gives the reason if no thresholds are known."""
+        """Return the result of the check. `unknown` is why no thresholds are known."""
         shares = self.shares()
         numbers = self._numbers(shares)
         crossed, measured = len(self.balance.crossed), len(self.balance.measured)
@@ -360,7 +360,7 @@ class TwoRuns:
 
 
 class _Bridge(Calculator):
-    """An ASE calculator that calls the audited calculator, and saves structures on which it fails."""
+    """An ASE calculator that calls another one, and saves structures on which it fails."""
 
     implemented_properties = ["energy", "forces"]  # noqa: RUF012
 
@@ -381,7 +381,7 @@ def prepared(
     period: float,
     rng: np.random.Generator,
 ) -> Atoms:
-    """Return a structure with thermal velocities; `period` is the period of the fastest vibration."""
+    """Return a structure with thermal velocities. `period` is the fastest period."""
     from ase import units
 
     # atoms at rest in their places take half of the kinetic energy into vibrations
@@ -400,7 +400,7 @@ def prepared(
 def fitting_timestep(
     subject: CalculatorSubject, atoms: Atoms, rng: np.random.Generator, iterations: int = _POWER_ITERATIONS
 ) -> tuple[float, float]:
-    """Estimate a time step and the fastest vibration's period (inf if none exists) in internal time units."""
+    """Estimate a time step and the shortest vibration period (or inf), in internal units."""
     roots = np.sqrt(atoms.get_masses())[:, None]
     mode = direction(len(atoms), rng)
     mode /= np.linalg.norm(mode)
@@ -462,10 +462,10 @@ def run(
 
 @dataclass
 class RigidGroups:
-    """ASE constraint that fixes all interatomic distances within groups of equal size, such as molecules.
+    """ASE constraint that fixes all distances within groups, such as molecules.
 
-    ASE's class FixBondLengths treats one bond at a time in Python. This class treats one bond of every group
-    at once, and is a hundred times faster than FixBondLengths for water.
+    ASE's class FixBondLengths treats one bond at a time in Python. For water, this class is a hundred
+    times faster.
 
     Source:
         H. C. Andersen, Rattle: a velocity version of the Shake algorithm, J. Comput. Phys. 52, 24 (1983).
@@ -518,7 +518,7 @@ class RigidGroups:
                 return
 
     def adjust_forces(self, atoms: Atoms, forces: Float[np.ndarray, "atoms 3"]) -> None:
-        """Leave the forces unchanged, since constrained runs adjust the momenta and not the forces."""
+        """Leave the forces unchanged. The momenta are adjusted instead."""
 
     def todict(self) -> dict[str, Any]:
         """Return the constraint as a dictionary in ASE's format for constraints."""
@@ -526,7 +526,7 @@ class RigidGroups:
 
 
 def rigid(atoms: Atoms) -> RigidGroups | None:
-    """Return a constraint on all distances within each molecule; None for a structure without molecules."""
+    """Return a constraint on all distances within molecules. None without molecules."""
     size = group(atoms)
     if size is None:
         return None

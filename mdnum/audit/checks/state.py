@@ -1,4 +1,4 @@
-"""Check that energies and forces of a calculator object do not depend on previously evaluated structures."""
+"""Check that results do not depend on previously evaluated structures."""
 
 from __future__ import annotations
 
@@ -27,17 +27,16 @@ _EPS = np.finfo(float).eps
 
 
 class StateCheck(AuditCheck):
-    """Do energy and forces depend on the structures that the calculator object evaluated before?
+    """Do energy and forces depend on previously evaluated structures?
 
-    The check repeats calls, and compares a used calculator object with new objects for sequences of growing,
-    shrinking, moving and strained structures.
+    The check compares used and new calculator objects for growing, shrinking, moving and strained structures.
     """
 
     name, title, order, basic, calls = "state", "Memory", 60, True, 500
     needed_to = ("run",)
 
     def ask(self, subject: CalculatorSubject, progress: Progress) -> CheckResult:
-        """Compare one calculator object that evaluates all structures with one new object per structure."""
+        """Compare one calculator object for all structures with new ones."""
         rng = np.random.default_rng(self.seed)
         with subject.meter.limited():
             atoms, noise = settled(subject.fresh(), rng, brief=self.brief)
@@ -137,7 +136,7 @@ class StateCheck(AuditCheck):
 
 @dataclass
 class Comparison:
-    """Energy and forces from a used calculator object and from a new one, for the same structure."""
+    """Energy and forces of one structure, from a used and a new calculator object."""
 
     sequence: str  # in which it was asked
     what: str  # happened to the structure
@@ -154,7 +153,7 @@ class Comparison:
 
     @property
     def refused(self) -> CalculatorError | None:
-        """Error raised by the new calculator object, or else by the used one; None if both succeeded."""
+        """Error of the new calculator object, or else of the used one, or None."""
         return next((one for one in (self.new, self.old) if isinstance(one, CalculatorError)), None)
 
     @property
@@ -170,7 +169,7 @@ class Comparison:
 
 
 def _approached(subject: CalculatorSubject) -> tuple[dict[str, list[SequenceStep]], Ways]:
-    """Return sequences of structures in which two atoms come within the cutoff, or why there are none."""
+    """Return sequences in which two atoms come within the cutoff, or why there are none."""
     what = "two atoms at the cutoff"
     try:
         thresholds = find_thresholds(subject)
@@ -187,7 +186,7 @@ def _approached(subject: CalculatorSubject) -> tuple[dict[str, list[SequenceStep
 def _through(
     subject: CalculatorSubject, sequence: list[SequenceStep], noise: NoiseFloor, name: str
 ) -> Iterator[Comparison]:
-    """Compare one calculator object's results for a sequence of structures with those of new objects."""
+    """Compare a sequence of results of one calculator object with those of new objects."""
     used = subject.used()
     before: Atoms | None = None
     known: dict[int, Answered] = {}
@@ -237,14 +236,14 @@ def _again(
 
 
 def _how(repeats: Mapping[str, Any]) -> str:
-    """Return the name of the text for a finding about repeated calls of a calculator."""
+    """Return the name of the text about repeated calls of a calculator."""
     if not repeats["bit-identical"]:
         return "state_not_repeated"
     return "state_repeated" if repeats["bit-identical between objects"] else "state_not_between"
 
 
 def _repeated(subject: CalculatorSubject, atoms: Atoms, brief: bool = False) -> dict[str, Any]:
-    """Evaluate a structure repeatedly: by one calculator, after another structure, and by new calculators."""
+    """Evaluate a structure repeatedly: by the same and by new calculators."""
     used = subject.fresh()
     aside = displaced(atoms, np.full((len(atoms), 3), 0.011))
     at_once, between, new = (2, 1, 2) if brief else (_AT_ONCE, _BETWEEN, _NEW)
@@ -294,10 +293,10 @@ def _unsteady(repeats: Mapping[str, Any], chance: Mapping[str, Any], kT: float) 
 
 
 def _tolerance(subject: CalculatorSubject, atoms: Atoms) -> float:
-    """Return the longest move (Å) of an atom or cell edge that leaves energy and forces unchanged, or 0.
+    """Return the longest move (Å) that leaves energy and forces unchanged, or 0.
 
-    A move is considered only if it should change several of the last digits of the energy and the forces. The
-    expected change of energy and forces is proportional to the length of the move.
+    The move must be long enough to change several of the last digits. The expected changes are proportional
+    to the length of the move.
     """
     # one coordinate, the largest: a tolerance may be one of all atoms together, or a share of a coordinate
     line = np.zeros((len(atoms), 3))
@@ -311,7 +310,7 @@ def _tolerance(subject: CalculatorSubject, atoms: Atoms) -> float:
 
 
 def _kept_within(subject: CalculatorSubject, sizes: np.ndarray, at: Callable[[float], Atoms]) -> float:
-    """Return the longest of several moves after which a calculator object returns its previous result."""
+    """Return the longest move after which a calculator returns its previous result."""
     used = subject.fresh()
     used.forgets = False
     places = np.array([0.0, *np.cumsum(sizes)])

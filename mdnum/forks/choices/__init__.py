@@ -1,4 +1,4 @@
-"""Numerical choices that can differ between two runs, for molecular dynamics and for the bouncing ball."""
+"""Numerical choices that can differ between two runs."""
 
 from __future__ import annotations
 

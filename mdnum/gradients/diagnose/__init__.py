@@ -1,4 +1,4 @@
-"""Diagnose a simulation's gradient: up to which step it can be trusted, and what contributes to it.
+"""Diagnose a gradient: up to which step it can be trusted, and why.
 
 Gradient methods compute different quantities: derivatives of the time steps, derivatives that include changes
 of flip times, finite differences of the loss, finite differences of an ensemble average, or derivatives of
@@ -83,7 +83,7 @@ class GradientDifference:
 
 @dataclass(frozen=True)
 class Agreement:
-    """Gradients of one run, computed by several methods and compared with a reference method."""
+    """Gradients of one run by several methods, compared with a reference method."""
 
     horizon: int  # steps
     reference: str  # name of the method that the others are compared with
@@ -92,7 +92,7 @@ class Agreement:
     comparisons: tuple[GradientDifference, ...]
 
     def gradient(self, method: str) -> Gradient | None:
-        """Return the gradient computed by the method with this name; None if there is none."""
+        """Return the gradient of the method with this name, or None."""
         return next((one.found for one in self.opinions if one.method == method), None)
 
 
@@ -189,7 +189,7 @@ def _meaning(
     name: str, one: Gradient, reference: Gradient, size: float, relative: float, rounding: float,
     grown: float, jumps: bool,
 ) -> tuple[str, dict[str, float] | None]:  # fmt: skip
-    """Return why two derivatives differ, and numbers that support this reason (None if no numbers exist)."""
+    """Return why two derivatives differ, and numbers that show this (or None)."""
     kinds = {one.kind: one, reference.kind: reference}
     if not np.isfinite(relative):
         return "unexplained", {}
@@ -223,7 +223,7 @@ def _meaning(
 
 @result
 class GradientDiagnosis:
-    """Analysis of the steps for which a gradient can be trusted; results that were not requested are None.
+    """Analysis of the steps for which a gradient can be trusted.
 
     Attributes:
         horizon: number of steps. names: full names of the parameters. value: value of the loss.
@@ -262,7 +262,7 @@ def diagnose(
     format: str = "float16",
     progress: Progress | None = None,
 ) -> GradientDiagnosis:
-    """Examine up to which step a gradient can be trusted, and what contributes to the gradient.
+    """Find the last step up to which a gradient can be trusted, and what contributes to it.
 
     Args:
         names: parameters, full or short names. parts: which of PARTS to compute.
@@ -358,7 +358,7 @@ def diagnose(
 
 
 def _methods(asked: Sequence[str | Method] | None) -> list[Method]:
-    """Convert names of gradient methods to objects; return all methods if none are given."""
+    """Convert names of gradient methods to objects. None means all methods."""
     return [by_name(one) if isinstance(one, str) else one for one in (METHODS if asked is None else asked)]
 
 

@@ -1,4 +1,4 @@
-"""Test cases for neighbor lists: atoms in a box, for a single call or for a sequence of calls."""
+"""Test cases for neighbor lists: atoms in a box, for one or several calls."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ Length = Annotated[FiniteFloat, Ge(0)]
 
 @dataclass(frozen=True)
 class Still:
-    """Positions of the atoms and cell vectors at one call of a neighbor list."""
+    """Positions and cell vectors at one call of a neighbor list."""
 
     positions: Rows  # length, shape (atoms, 3)
     cell: Vectors  # lattice vectors as rows, length; rows of axes that do not repeat may hold anything finite
@@ -61,7 +61,7 @@ class Still:
 
 @dataclass(frozen=True)
 class Case:
-    """A test case: atoms in a box, at one or several calls of a neighbor list, and a cutoff."""
+    """A test case: atoms in a box at one or several calls, and a cutoff."""
 
     name: str  # what is special, in words
     area: str  # a key of `AREAS`
@@ -77,7 +77,7 @@ class Case:
 
     @property
     def atoms(self) -> int:
-        """Number of atoms in the test case; the largest number if calls have different numbers of atoms."""
+        """Number of atoms in the test case. The largest if calls differ."""
         return max(len(still.positions) for still in self.stills)
 
     @property
@@ -86,11 +86,11 @@ class Case:
         return len(self.stills)
 
     def until(self, steps: int) -> Case:
-        """Return the test case with only its first `steps` calls of the neighbor list."""
+        """Return the test case with only its first `steps` calls."""
         return replace(self, stills=self.stills[:steps])
 
     def only(self, atoms: ndarray) -> Case:
-        """Return the test case with only some of the atoms, in the given order."""
+        """Return the test case with some of the atoms, in the given order."""
         stills = tuple(
             replace(still, positions=still.positions[atoms[atoms < len(still.positions)]])
             for still in self.stills
@@ -98,7 +98,7 @@ class Case:
         return replace(self, stills=stills, known=None if self.known is None else _among(self.known, atoms))
 
     def changed(self, positions: Any = None, cell: Any = None, **other: Any) -> Case:
-        """Return the test case with functions applied to positions and cell of every neighbor-list call."""
+        """Return the test case with functions applied to positions and cell."""
         same = lambda rows: rows  # noqa: E731
         x, box = positions or same, cell or same
         stills = tuple(replace(one, positions=x(one.positions), cell=box(one.cell)) for one in self.stills)
@@ -113,7 +113,7 @@ class Case:
 
 
 def matrix(cell: Any) -> ndarray:
-    """Convert a matrix, three edge lengths or the edge of a cube to lattice vectors, as rows."""
+    """Convert a matrix, edge lengths or a cube's edge to lattice vectors (rows)."""
     cell = np.asarray(cell, np.float64)
     return np.diag(cell * np.ones(3)) if cell.ndim < 2 else cell
 
@@ -132,7 +132,7 @@ def once(
     r_cut: float = 1.0,
     known: PairSet | None = None,
 ) -> Case:
-    """Return a test case with one call of the neighbor list; if no cell is given, there is no box."""
+    """Return a test case with one call. Without a cell, there is no box."""
     if cell is None:
         cell, pbc = np.zeros((3, 3)), False
     return Case(name, area, (Still(positions, matrix(cell)),), _axes(pbc), float(r_cut), known=known)
@@ -147,14 +147,14 @@ def sequence(
     skin: float = 0.3,
     pbc: bool | Sequence[bool] = True,
 ) -> Case:
-    """Return a test case with several calls, each with positions or a tuple (positions, cell)."""
+    """Return a test case with several calls: positions or tuples (positions, cell)."""
     places = (place if isinstance(place, tuple) else (place, cell) for place in path)
     stills = tuple(Still(positions, matrix(box)) for positions, box in places)
     return Case(name, area, stills, _axes(pbc), float(r_cut), float(skin))
 
 
 def _among(pairs: PairSet, atoms: ndarray) -> PairSet:
-    """Return the pairs in which both atoms are in `atoms`; atom indices become indices into `atoms`."""
+    """Return the pairs within `atoms`, as indices into `atoms`."""
     most = int(max(atoms.max(initial=-1), pairs.i.max(initial=-1), pairs.j.max(initial=-1))) + 1
     new = np.full(most, -1)
     new[atoms] = np.arange(len(atoms))

@@ -1,4 +1,4 @@
-"""Test cases for neighbor lists: named past failures, dense clusters, lattices, and random test cases.
+"""Test cases for neighbor lists: past failures, clusters, lattices, and random cases.
 
 For the tests of a library: `@given(cases())` draws test cases with all kinds of boxes and positions. Cutoffs
 of the test cases are at and between neighbor shells. `boxes()` draws only (cell, pbc, description).
@@ -35,7 +35,7 @@ _TURN = np.array([[2.0, -2.0, 1.0], [1.0, 2.0, 2.0], [2.0, 1.0, -2.0]]) / 3.0
 
 
 def catalog() -> Iterator[Case]:
-    """Yield every named test case with one call of the neighbor list, including those in questions.toml."""
+    """Yield every named test case with one call."""
     computed = {"boxes": _boxes(), "axes": _axes(), "outside": _outside(), "ties": _ties()}
     for area in ("few", "boxes", "axes", "images", "outside", "ties", "coincident"):
         yield from (once(name, area, *rest) for name, *rest in computed.get(area, ()))
@@ -48,7 +48,7 @@ def catalog() -> Iterator[Case]:
 
 
 def crowds() -> Iterator[Case]:
-    """Yield test cases with very many neighbors per atom, in isolated clusters or in a dilute gas."""
+    """Yield test cases with very many neighbors per atom."""
     return (once(name, "crowded", *rest) for name, *rest in _crowds())
 
 
@@ -120,9 +120,9 @@ def _outside() -> Named:
 
 
 def _across_walls() -> ndarray:
-    """Return pairs of atoms along x, just less than r_cut apart; one atom is just below a multiple of r_cut.
+    """Return pairs along x, just less than r_cut apart, near a multiple of r_cut.
 
-    If rounding to float32 assigns an atom to the next grid cell, its partner is two grid cells away.
+    After rounding to float32, the partner may be two grid cells away.
     """
     hairs = (1e-6, 5.5e-8, 1e-9, 3e-12, 2e-16)
     pairs = []
@@ -163,10 +163,9 @@ def _crowds() -> Named:
 
 
 def vast() -> Iterator[Case]:
-    """Yield test cases with a volume so large that a cell grid needs too much memory or 64-bit indices.
+    """Yield test cases with a volume too large for a simple cell grid.
 
-    Very large volumes are tested in a separate process, because a process that allocates a huge cell grid may
-    be killed.
+    They run in a separate process, as a huge cell grid may kill it.
     """
     apart = np.array([[0.0, 0.0, 0.0], [0.5, 0.5, 0.5], [700.0, 2500.0, 2400.0], [700.5, 2500.0, 2400.0]])
     yield once("two pairs thousands of cutoffs apart, free", "axes", apart)
@@ -175,10 +174,10 @@ def vast() -> Iterator[Case]:
 
 
 def lattice(edge: int, seed: int = 0) -> Case:
-    """Return atoms on a cubic integer lattice with vacancies, in random order and random periodic images.
+    """Return atoms on a cubic lattice with vacancies, in random order and images.
 
-    The neighbors of each atom are on the 26 sites around it. Neighbors are found from site indices modulo the
-    edge length of the lattice, without a search and without rounding.
+    The neighbors of each atom are on the 26 sites around it. Neighbors follow from site indices, without
+    rounding.
 
     Args:
         edge: number of sites along an edge.
@@ -283,7 +282,7 @@ def _edges(size: str, rng: np.random.Generator) -> ndarray:
 
 @st.composite
 def cases(draw: Any, most: int = 40) -> Case:
-    """Draw a random test case with at most `most` atoms and a single call of the neighbor list."""
+    """Draw a random test case with one call and at most `most` atoms."""
     scale = draw(st.sampled_from((1.0, 1.0, 1.0, 2.5, 6.0, 0.1, 3.405)))
     cell, pbc, words = draw(boxes(scale))
     place = draw(st.sampled_from(PLACES))
@@ -299,7 +298,7 @@ def cases(draw: Any, most: int = 40) -> Case:
 
 
 def _images(cell: ndarray, pbc: Pbc, r_cut: float) -> int:
-    """Return the number of periodic images that must be searched for pairs of atoms inside the cutoff."""
+    """Return the number of periodic images to search along each direction."""
     if not any(pbc):
         return 1
     width = widths(completed(cell, np.array(pbc)))
@@ -309,7 +308,7 @@ def _images(cell: ndarray, pbc: Pbc, r_cut: float) -> int:
 def _positions(
     place: str, count: int, cell: ndarray, pbc: ndarray, r_cut: float, rng: np.random.Generator
 ) -> tuple[ndarray, float]:
-    """Return positions and a cutoff, which equals a pair distance if `place` is "at the cutoff"."""
+    """Return positions and a cutoff. The cutoff is a pair distance for "at the cutoff"."""
     full = completed(cell, pbc)
     # free axes have vectors of length 1, which would be no room
     room = np.where(pbc, 1.0, np.maximum(1.0, 3.0 * r_cut / np.linalg.norm(full, axis=1)))
@@ -357,9 +356,9 @@ def plan(
     far: bool = False,
     large: bool = False,
 ) -> list[tuple[int, Iterable[Case]]]:
-    """Return groups of test cases for a neighbor list, in order, as tuples (number of cases, cases).
+    """Return groups of test cases as tuples (number of cases, cases).
 
-    The first group has up to `BREADTH` named test cases of each area; random and large cases follow.
+    First come up to `BREADTH` named test cases of each area, then random and large ones.
 
     Args:
         count: number of random cases.
@@ -398,13 +397,13 @@ def lattices() -> Iterator[Case]:
 
 
 def as_kept(tested: PairList, asked: Iterable[Case]) -> Iterator[Case]:
-    """Yield the given test cases, with a skin of 0.3 times the cutoff if the neighbor list is updatable."""
+    """Yield the test cases, with a skin of 0.3 r_cut for updatable lists."""
     for case in asked:
         yield replace(case, skin=0.3 * case.r_cut) if tested.kept else case
 
 
 def drawn(count: int, seed: int) -> list[Case]:
-    """Return test cases drawn by hypothesis; the same seed gives the same test cases."""
+    """Return test cases drawn by hypothesis. A seed always gives the same cases."""
     collected: list[Case] = []
     checks: Any = list(hypothesis.HealthCheck)
 
@@ -426,7 +425,7 @@ def drawn(count: int, seed: int) -> list[Case]:
 
 
 def alike(case: Case) -> Iterator[tuple[str, bool, Case]]:
-    """Yield (description, whether neighbor pairs must stay the same, variant) for variants of a test case."""
+    """Yield (description, whether neighbors stay the same, variant) of a test case."""
     yield "when it is asked anew", True, case
     if case.atoms > 1:
         yield "with its atoms in reverse order", True, case.only(np.arange(case.atoms)[::-1])
@@ -448,7 +447,7 @@ def alike(case: Case) -> Iterator[tuple[str, bool, Case]]:
 
 
 def _wrapped(still: Still, pbc: ndarray) -> Still:
-    """Return the atoms of a test case at one call, wrapped into the box."""
+    """Return the atoms at one call, wrapped into the box."""
     if not pbc.any() or not len(still.positions):
         return still
     matrix = completed(still.cell, pbc)

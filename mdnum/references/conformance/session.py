@@ -1,4 +1,4 @@
-"""Call a neighbor list, in this process or a separate one, and return its pairs or errors."""
+"""Call a neighbor list, in this or another process. Return its pairs or errors."""
 
 from __future__ import annotations
 
@@ -59,7 +59,7 @@ class CallOutcome:
 
 
 class Session:
-    """Calls a neighbor list; if `reuse` is True, a single list object is used for all test cases."""
+    """Calls a neighbor list. If `reuse` is True, all test cases use one list object."""
 
     starts, deadline = 0, Deadline()  # of a process; calls in this one have none
 
@@ -69,11 +69,11 @@ class Session:
         self._returned: list[ndarray] = []
 
     def ask(self, case: Case) -> list[CallOutcome]:
-        """Return the pairs or error of every call in a test case, up to the first call without pairs."""
+        """Return the pairs or error of each call, up to the first error."""
         return list(self.outcomes(case))
 
     def outcomes(self, case: Case) -> Iterator[CallOutcome]:
-        """Yield the pairs or error of every call in a test case, up to the first call without pairs."""
+        """Yield the pairs or error of each call, up to the first error."""
         if self._made is None or (self.tested.kept and not self.reuse):
             try:
                 self._made = self.tested.make()
@@ -103,7 +103,7 @@ class Session:
     def _call(
         self, case: Case, positions: ndarray, cell: ndarray, pbc: ndarray, skin: float | None
     ) -> CallOutcome:
-        """Call the neighbor list once; allocate an updatable list if `skin` is given, otherwise update it."""
+        """Call the neighbor list once. If `skin` is given, allocate an updatable list."""
         inputs = {"positions": positions, "cell": cell, "pbc": pbc}
         before = {name: array.copy() for name, array in inputs.items()}
         returned, self._returned = self._returned, []
@@ -158,8 +158,8 @@ def _failed(error: Exception | SystemExit, case: Case, package: str | None) -> C
 def meant(error: Exception, package: str | None = None) -> bool:
     """Return whether an exception was raised deliberately because the input is not supported.
 
-    A deliberate exception prevents a calculation with wrong pairs. An accidental exception, such as a
-    ValueError from `min()` of an empty array, shows that the input was not anticipated.
+    A deliberate exception prevents a calculation with wrong pairs. An accidental exception shows that the
+    input was not anticipated.
 
     Args:
         error: the exception, with its traceback.
@@ -188,7 +188,7 @@ def meant(error: Exception, package: str | None = None) -> bool:
 
 
 def _is_own(module: str, own: str) -> bool:
-    """Return whether a module belongs to the neighbor list, not to Python or a common numerical library."""
+    """Return whether a module belongs to the neighbor list's own code."""
     top = module.partition(".")[0]
     return bool(top) and (top.lower() == own or (top not in _BORROWED and top not in sys.stdlib_module_names))
 
@@ -204,7 +204,7 @@ def _at_raise(place: TracebackType) -> bool:
 
 
 def _called_module(place: TracebackType) -> str:
-    """Return the name of the module whose compiled function a stack frame is calling, or ""."""
+    """Return the module whose compiled function a stack frame calls, or ""."""
     code = place.tb_frame.f_code
     where = next(islice(code.co_positions(), max(0, place.tb_lasti // 2), None), (None,) * 4)
     first, last, left, right = where
@@ -232,7 +232,7 @@ def _called_module(place: TracebackType) -> str:
 
 
 def _value(name: ast.expr, place: TracebackType) -> Any:
-    """Return the value of a variable or attribute in an exception's stack frame; None if it is unknown."""
+    """Return the value of a variable in an exception's stack frame, or None."""
     if isinstance(name, ast.Attribute):
         return getattr(_value(name.value, place), name.attr, None)
     if not isinstance(name, ast.Name):
@@ -245,7 +245,7 @@ def _value(name: ast.expr, place: TracebackType) -> Any:
 class RemoteSession:
     """Calls of one named neighbor list in a separate process.
 
-    If the process crashes, the crash is a finding, and a new process is started.
+    A crash of the process is a finding. Then a new process is started.
     """
 
     most = np.inf  # seconds that an answer may take, where that is less than usual
@@ -260,7 +260,7 @@ class RemoteSession:
         self._from = 0
 
     def ask(self, case: Case) -> list[CallOutcome]:
-        """Return the pairs or error of each call in a test case, up to the first call that returns no pairs.
+        """Return the pairs or error of each call, up to the first error.
 
         Raises:
             TimeUp: the deadline passed during the call; the separate process is terminated.
@@ -342,7 +342,7 @@ class _Ended(Exception):
 
 
 def _watch(process: Any, seconds: float, deadline: Deadline, done: threading.Event, late: list[str]) -> None:
-    """Kill a process that exceeds its time limit; append to `late` whether it computed or only waited."""
+    """Kill a process after its time limit. Append to `late` whether it computed or waited."""
     began, used = time.monotonic(), _processor_seconds(process.pid)
     left = seconds
     while not done.wait(min(left, deadline.left)):
@@ -358,7 +358,7 @@ def _watch(process: Any, seconds: float, deadline: Deadline, done: threading.Eve
 
 
 def _processor_seconds(process: int) -> float | None:
-    """Return the processor time (s) of a process, summed over all threads; None if unknown."""
+    """Return the processor time (s) of a process. None if unknown."""
     try:
         # the second word is the name of the program in brackets, which may hold blanks
         words = Path(f"/proc/{process}/stat").read_text().rpartition(")")[2].split()
@@ -380,7 +380,7 @@ def _received(stream: BinaryIO | Any) -> Any:
 
 
 def serve(word: str, parent: int) -> None:
-    """Run test cases from stdin on a neighbor list; this is the main function of a separate process."""
+    """Run test cases from stdin on a neighbor list, in a separate process."""
     from mdnum.references.conformance.peers import load
 
     # a list may print: what it writes to stdout must not be taken for an answer

@@ -1,4 +1,4 @@
-"""Reduce a failing test case to few atoms, few calls and round numbers that fail in the same way."""
+"""Reduce a failing test case to few atoms, few calls and round numbers."""
 
 from __future__ import annotations
 
@@ -30,9 +30,9 @@ Failures = Callable[[Case], Sequence[Failure]]
 
 
 def shrunk(failures: Failures, failed: Failed, deadline: Deadline | None = None) -> Failed:
-    """Return the smallest test case tried before the deadline that fails with the same error code.
+    """Return the smallest test case that fails with the same error code.
 
-    `failures` runs a test case and returns its failures; each time, it creates an updatable list anew.
+    `failures` runs a test case and returns its failures.
     """
     deadline = deadline or Deadline()
     sought, least = failed.worst.kind, min(1, failed.case.atoms)
@@ -73,13 +73,13 @@ def shrunk(failures: Failures, failed: Failed, deadline: Deadline | None = None)
 
 
 def _only(case: Case, atoms: list[int]) -> Case:
-    """Return the test case with only the given atoms; stored exact pairs are removed for up to 400 atoms."""
+    """Return the test case with only the given atoms. Exact pairs may be removed."""
     smaller = case.only(np.array(atoms, int))
     return replace(smaller, known=None) if len(atoms) <= 400 else smaller
 
 
 def _sensible(case: Case) -> bool:
-    """Return whether a test case has finite numbers, a nonsingular box and not too many periodic images."""
+    """Return whether a test case has finite numbers and a usable box."""
     pbc = np.array(case.pbc)
     if not (0 < case.r_cut < np.inf and all(np.isfinite(still.positions).all() for still in case.stills)):
         return False
@@ -98,7 +98,7 @@ def _sensible(case: Case) -> bool:
 
 
 def _simplifications(case: Case) -> Iterator[Callable[[Case], Case]]:
-    """Yield functions that simplify a test case: fewer periodic axes, right angles, fewer digits, zeros."""
+    """Yield functions that simplify a test case, such as fewer digits."""
     for axis in range(3):
         yield lambda case, axis=axis: replace(
             case, pbc=tuple(on and n != axis for n, on in enumerate(case.pbc)), known=None
@@ -128,10 +128,10 @@ def _simplifications(case: Case) -> Iterator[Callable[[Case], Case]]:
 
 
 def deepest(failures: Failures, failed: Failed) -> Failed:
-    """Move the two atoms of a missing pair closer together as long as the list still omits the pair.
+    """Move the atoms of a missing pair closer while the list omits the pair.
 
-    All atoms move further along their displacement between the first and the second call of the neighbor
-    list. The reported failure then shows the smallest distance at which the list omits the pair.
+    All atoms move along their displacement between the first two calls. The failure then shows the smallest
+    distance of an omitted pair.
     """
     case = failed.case
     if failed.code != "MISSING" or case.area != "rule" or case.steps != 2 or not failed.alone:
@@ -148,7 +148,7 @@ def deepest(failures: Failures, failed: Failed) -> Failed:
 
 
 def reduced(examiner: Examiner, failed: Failed, before: tuple[Case, ...], deadline: Deadline) -> Failed:
-    """Reduce a failure to few atoms and calls, and run the script that reproduces the failure."""
+    """Reduce a failure, and run the script that reproduces it."""
 
     def failures(case: Case) -> Sequence[Failure]:
         with suppress(TimeUp):
@@ -176,7 +176,7 @@ def reduced(examiner: Examiner, failed: Failed, before: tuple[Case, ...], deadli
 def _needing(
     examiner: Examiner, failed: Failed, before: tuple[Case, ...], deadline: Deadline
 ) -> Failed | None:
-    """Find earlier test cases that a new process must run first to show a failure; None if none are found."""
+    """Find earlier test cases without which a failure does not occur, or None."""
     session, began = examiner.session, time.perf_counter()
 
     def fails(cases: Sequence[Case]) -> bool:
