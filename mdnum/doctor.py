@@ -3,10 +3,10 @@
 All tests of `mdnum doctor` are computations on the current machine. Package versions with known faults are
 also reported. No version is assumed correct.
 
-Error bounds in mdnum assume that +, -, *, / and sqrt are correctly rounded. They also assume that sums are
-not reordered. On CPUs, XLA rounds correctly and does not reorder sums. It contracts a*b+c and rewrites
-divisions by constants. Contractions and rewritten divisions change the last bits of results. Two builds of a
-program may therefore decide differently on a pair at the cutoff, within the error bound.
+Error bounds in mdnum assume that +, -, *, / and sqrt are correctly rounded. Sums must not be reordered. On
+CPUs, XLA rounds correctly and does not reorder sums. XLA does contract a*b+c and rewrite divisions by
+constants. Contractions and rewritten divisions change the last bits of results. Two builds of a program may
+therefore decide differently on a pair at the cutoff, within the error bound.
 """
 
 from __future__ import annotations
@@ -200,8 +200,8 @@ def float64() -> DoctorRow:
 def elementwise() -> DoctorRow:
     """Compare basic operations of jax with numpy, bit for bit, in float64 and float32.
 
-    On accelerators, float32 quotients and square roots may be approximate. Cutoff decisions do not use them
-    (`numerics.exact.root`).
+    On accelerators, float32 quotients and square roots may be approximate. Cutoff decisions use other
+    operations (`numerics.exact.root`).
     """
     # by name, which numpy and jax share, with the number of arguments
     operations = {

@@ -1,8 +1,8 @@
 """Record of the software and the machine of a run, which helps to explain differences between runs.
 
 Two runs of the same system file and structure should agree bit for bit if their fingerprints agree. The
-fingerprint includes versions, instruction sets and devices. It also includes XLA's flags, jax's settings and
-dtypes.
+fingerprint includes versions, instruction sets and devices. XLA's flags, jax's settings and dtypes are also
+included.
 """
 
 from __future__ import annotations

@@ -45,7 +45,7 @@ def wrong_places(subject: CalculatorSubject, atoms: Atoms, allowed: NoiseFloor) 
 
     Exchanging two like atoms between correct places changes neither energy nor forces. An error tied to a
     place appears there for any order of the atoms. Other errors depend on the order of all atoms, such as a
-    neglected neighbor. They appear at nearly all places, or move if atoms are reordered.
+    neglected neighbor. Such errors appear at nearly all places, or move if atoms are reordered.
 
     Returns:
         None if energy and forces are correct at all places, or if they are wrong at nearly all places.

@@ -266,7 +266,7 @@ class Contact(Protocol):
         ...
 
     def acceleration(self, y: Balls, v: Balls, free: Balls, contact: Touching, r: Rounding) -> Balls:
-        """Return the acceleration of a state. Some schemes use it again in the next step."""
+        """Return the acceleration of a state. Some schemes use this acceleration again in the next step."""
         ...
 
 
@@ -320,8 +320,8 @@ class Projection(_Forceless):
     """Iterate y ← y + alpha k max(0, -y) until the stopping rule holds; then clamp y and apply restitution.
 
     Each iteration multiplies the penetration by 1 - alpha k. Hence p0 falls to tol after ceil(log(tol / p0) /
-    log(1 - alpha k)) iterations. Iterations overshoot for alpha k between 1 and 2. They never end for alpha k
-    = 2. The floor is at 0 for any k. The value of k affects only the remaining penetration.
+    log(1 - alpha k)) iterations. Iterations overshoot for alpha k between 1 and 2. For alpha k = 2,
+    iterations never end. The floor is at 0 for any k. The value of k affects only the remaining penetration.
     """
 
     k: Any  # gain, dimensionless; what is learned in place of a stiffness
@@ -372,8 +372,9 @@ class Impact(_Forceless):
     """Instantaneous impact: v ← -restitution v at the floor.
 
     With `EventLocated`, the impact takes place at its exact time. The flight then continues until the end of
-    the step. With another scheme, a ball below the floor is put on the floor at the end of the step. Its
-    velocity is reset. This causes an error of order h in the state and of order 1 in the derivative.
+    the step. With another scheme, a ball below the floor is put on the floor at the end of the step. The
+    velocity of this ball is reset. Such a reset causes an error of order h in the state and of order 1 in the
+    derivative.
     """
 
     restitution: Any = 0.8  # speed after over speed before

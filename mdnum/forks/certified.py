@@ -115,7 +115,7 @@ def _cutoffs(decider: PairDecider) -> Float[np.ndarray, "types"]:
 def wider(twin: Twin) -> str | None:
     """Return the program that is more precise in some role and less precise in none, or None.
 
-    The programs may differ only in precision. Another time step has effects beyond rounding.
+    The programs may differ only in precision. A different time step has effects beyond rounding.
     """
     a, b = twin.a.simulation, twin.b.simulation
     if twin.a.begin is not None or twin.b.begin is not None or _but_for_roles(a) != _but_for_roles(b):

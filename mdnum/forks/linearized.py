@@ -2,8 +2,8 @@
 
 The tangent (the derivative of the state) is propagated along the recorded states. The reference trajectory is
 therefore the recorded run, bit for bit. The exponential growth rate of the tangent is the largest Lyapunov
-exponent. It is rescaled repeatedly (Benettin, Galgani, Giorgilli and Strelcyn 1980). Unlike the distance
-between two runs, it does not saturate.
+exponent. The tangent is rescaled repeatedly (Benettin, Galgani, Giorgilli and Strelcyn 1980). Unlike the
+distance between two runs, the tangent does not saturate.
 
 Each decision has a margin m and a tangent dm/da for the amplitude a of the perturbation. To first order, the
 decision flips at a = -m / (dm/da). At each step, a perturbation below the smallest flip amplitude flips no

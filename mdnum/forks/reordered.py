@@ -9,7 +9,7 @@ larger labels form one sum, those from smaller labels another.
 
 Source: jax_md.smap.pair_neighbor_list of jax-md 0.2.29, whose forces are reproduced bit for bit
 (tests/forks/test_choices.py). XLA adds more than 32 slots of an atom in blocks of 32. This module does not
-reproduce that.
+reproduce such blocks.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ class ReorderedSimulation(Simulation):
 
     @classmethod
     def of(cls, simulation: Simulation, order: str | int) -> ReorderedSimulation:
-        """Create a simulation with reordered neighbor lists. Sequential sums follow this order."""
+        """Create a simulation with reordered neighbor lists. Sequential sums follow the new order."""
         same = _fields(Simulation, simulation)
         if isinstance(order, str) and simulation.reduction == Sequential():
             same["reduction"] = _SUMS[order]

@@ -1,6 +1,6 @@
 """Build the programs of systems, and read and change system parameters.
 
-Modules of molecular dynamics are imported inside functions. They need jax_md, but a ball does not.
+Modules of molecular dynamics are imported inside functions. Molecular dynamics needs jax_md, a ball does not.
 """
 
 from __future__ import annotations

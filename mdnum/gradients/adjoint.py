@@ -1,11 +1,11 @@
 """Reverse-mode derivatives of a simulation at its recorded states and decisions.
 
-With jax.value_and_grad, the forward pass rounds differently from an ordinary run. After some thousand steps
-it makes other decisions. This module therefore makes and records an ordinary run first.
+With jax.value_and_grad, the forward pass rounds differently from an ordinary run. After some thousand steps,
+the forward pass makes other decisions. This module therefore makes and records an ordinary run first.
 
 A conservative force is a gradient, so its Jacobian J is symmetric. For a pair potential, J times a vector is
-a sum over neighbors, like the forces. For other energies, it is a directional derivative of the forces.
-Reverse mode therefore needs no record of the operations within a step.
+a sum over neighbors, like the forces. For other energies, J times a vector is a directional derivative of the
+forces. Reverse mode therefore needs no record of the operations within a step.
 """
 
 from __future__ import annotations

@@ -2,9 +2,9 @@
 
 A perturbed pair crosses the cutoff earlier or later. If the force jumps at the cutoff, another crossing time
 also changes the pair's momentum. The derivative at fixed decisions omits this change, however short the time
-step. A saltation matrix (mdnum.numerics) adds it at each crossing. The potential energy and the virial also
-jump at a crossing. If a loss sums energies or virials over frames, a later crossing shifts the jump by a
-fraction of a frame.
+step. A saltation matrix (mdnum.numerics) adds the effect of the crossing time. The potential energy and the
+virial also jump at a crossing. If a loss sums energies or virials over frames, a later crossing shifts the
+jump by a fraction of a frame.
 
 Let a pair have the radial force jump f (positive: repulsive) and the radial speed s. A change dr of its
 distance changes the crossing time by -dr/s, and the momentum along the pair by f dr/s.
@@ -97,8 +97,8 @@ class Crossings:
 
     @property
     def kick(self) -> Float[np.ndarray, "crossings"]:
-        """Force jump (energy/length) divided by the radial speed (length/time), for each crossing. This is
-        the change of the pair's radial momentum per change of its distance.
+        """Force jump (energy/length) divided by the radial speed (length/time), for each crossing. The
+        quotient is the change of the pair's radial momentum per change of its distance.
         """
         return self.force / self.speed
 
@@ -207,7 +207,7 @@ def of_energy(
     onto: tuple[Float[Array, "3 atoms"], Float[Array, ""], Float[Array, ""]],
     squeeze: Float[Array, "*axes"] | None = None,
 ) -> Float[Array, "most"]:
-    """Compute cotangents of crossing distances. The energy function is evaluated with and without each pair.
+    """Compute cotangents of crossing distances. The energy is evaluated with and without each pair.
 
     The jump affects all atoms whose energy depends on the pair. The jump is evaluated at the cutoff distance.
     Other pairs have their decisions at the end of the step.

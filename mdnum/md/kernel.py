@@ -99,7 +99,7 @@ def over_pairs(
     near: Shortcut | None = None,
     totals: int = 0,
 ) -> PairSums | None:
-    """Sum a pair function over the neighbors of every atom. Use it inside jit and on a CPU.
+    """Sum a pair function over the neighbors of every atom. This function works inside jit and on a CPU.
 
     Args:
         pair: a function of scalars: the columns of the atom, those of its neighbor, the pair type (None if
@@ -159,7 +159,7 @@ def left_out(potential: Any) -> str | None:
 
 
 class _NotKnown(Exception):
-    """Error for a jax operation without an LLVM counterpart. Its message is the operation's name."""
+    """Error for a jax operation without LLVM counterpart. The message is the operation's name."""
 
 
 class _Value(NamedTuple):
@@ -771,7 +771,7 @@ def _help(job):
 
 @njit
 def _helped(job, frame, helpers, task):
-    """Schedule helper threads of XLA. If this fails, the calling thread does all the work."""
+    """Schedule helper threads of XLA. Without helpers, the calling thread does all the work."""
     api, asked = peek(frame, 2), job + 8 * _ASKED
     schedule, ask = peek(api, 17), peek(api, 18)
     poke(asked, 0, 32)

@@ -122,7 +122,7 @@ def is_inexact(leaf: Any) -> bool:
 
 @dataclass
 class _Interpreter:
-    """Interpreter that runs a jaxpr one operation at a time. It finds results that are not finite."""
+    """Interpreter that runs a jaxpr one operation at a time and finds results that are not finite."""
 
     mended: list[int]  # numbers of operations whose results are made finite
     found: Operation | None = None  # the first operation at fault

@@ -1,8 +1,8 @@
 """Sums that do not depend on the order of the terms. Also the registry of all summation orders.
 
 A finite float is an integer multiple of its format's smallest subnormal number. The exact sum expresses all
-terms as integers and adds them in a long accumulator of 32-bit limbs (Kulisch & Miranker 1986). It rounds
-once. The fixed-point sum rounds every term to a coarser unit. One int64 can then hold the sum.
+terms as integers and adds them in a long accumulator of 32-bit limbs (Kulisch & Miranker 1986). The exact sum
+is rounded once. The fixed-point sum rounds every term to a coarser unit. One int64 can then hold the sum.
 """
 
 from __future__ import annotations

@@ -210,7 +210,7 @@ class Permuted(Reduction):
     seed: int = 0  # of the order; the same for every sum of as many terms
 
     def sum_of(self, terms: jax.Array, add: Add) -> jax.Array:
-        """Add the terms in a random order. It depends only on the seed and the number of terms."""
+        """Add the terms in a random order. This order depends only on the seed and the number of terms."""
         return in_order(terms[np.random.default_rng(self.seed).permutation(len(terms))], add)
 
 

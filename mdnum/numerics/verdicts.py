@@ -2,7 +2,7 @@
 
 A flip is a cutoff decision that differs between two runs. The verdict compares the second run with a
 counterfactual run. The counterfactual run has the arithmetic of run B, but the cutoff decisions of run A. If
-it stays close to run A, the flips caused the split. If it also splits, repeats of both runs decide. They show
+the counterfactual run stays close to run A, the flips caused the split. Otherwise repeats of both runs show
 whether the flips made the split occur earlier. Repeats are evaluated by a sequential sign test. Assume that
 removing the flips delays a split with a probability of at most 1/2. Then k or more of n splits are delayed at
 most as often as n coin tosses give k or more heads. The initial displacements of all repeats have the same
@@ -204,7 +204,7 @@ class Growth:
 
     @property
     def plain(self) -> bool:
-        """True if the distance clearly grows. The fit is then not a fit of noise."""
+        """True if the distance clearly grows. Otherwise the fit is a fit of noise."""
         return bool(np.isfinite(self.rate) and self.rate > 0 and self.r_squared > FITS)
 
 

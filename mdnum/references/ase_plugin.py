@@ -1,4 +1,4 @@
-"""Module that registers mdnum as a plugin of ASE. It imports no other module of mdnum."""
+"""Module that registers mdnum as a plugin of ASE, without an import of other modules."""
 
 from __future__ import annotations
 

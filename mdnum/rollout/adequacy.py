@@ -20,9 +20,9 @@ _NODES, _FEWER, _AGREE = 200, 100, 1e-3
 def fastest_period(simulation: Simulation, positions: Float[np.ndarray, "atoms 3"]) -> float | None:
     """Period of the fastest vibration, in the user's time unit. None if there is no vibration.
 
-    A Lanczos iteration finds the largest eigenvalue of the mass-weighted Hessian. It uses finite differences
-    of forces. Forces are shifted to zero at the cutoff, because pairs may cross the cutoff between two
-    evaluations. This shift changes the Hessian only by a small transverse term.
+    A Lanczos iteration finds the largest eigenvalue of the mass-weighted Hessian. The iteration uses finite
+    differences of forces. Forces are shifted to zero at the cutoff, because pairs may cross the cutoff
+    between two evaluations. Shifted forces change the Hessian only by a small transverse term.
 
     Args:
         simulation: the system as objects.
@@ -56,7 +56,8 @@ def fastest_period(simulation: Simulation, positions: Float[np.ndarray, "atoms 3
 
 
 def beyond_cutoff(simulation: Simulation, volume: float | None = None) -> Mapping[str, float] | None:
-    """Tail corrections to energy and pressure for pairs beyond the cutoff. They assume g(r) = 1.
+    """Tail corrections to energy and pressure for pairs beyond the cutoff. The radial distribution function
+    g(r) is taken as 1.
 
     Args:
         simulation: the system as objects.

@@ -24,8 +24,8 @@ from mdnum.systems.simulation import Simulation
 class Counterfactual:
     """A run with its own arithmetic and the cutoff decisions of another run (the leader).
 
-    Its own decisions are also computed, and differences from the leader's are counted. The object is called
-    with each segment of the leader's run. The method `until` returns the simulated time steps.
+    The run's own decisions are also computed. Differences from the leader's decisions are counted. The object
+    is called with each segment of the leader's run. The method `until` returns the simulated time steps.
 
     Args:
         simulation: the run whose arithmetic is used.

@@ -1,7 +1,7 @@
 """Control of a simulation run.
 
-The engine builds a neighbor list and starts the compiled loop over the steps that use this list. It then
-yields the records of the loop. A record is yielded after the next loop has been started. The caller thus
+The engine builds a neighbor list and starts the compiled loop over the steps that use this list. The engine
+then yields the records of the loop. A record is yielded after the next loop has been started. The caller thus
 processes a record while the device computes the next one.
 """
 
@@ -248,7 +248,7 @@ class Engine:
         self.leaves = tuple(leaves)
 
     def _room(self, words: int) -> int:
-        """Return the number of steps that a record can hold. It is a power of two within the memory limit."""
+        """Return the number of steps that a record can hold, a power of two."""
         kept = self.record and self.rows
         per_row = self.simulation.atoms * (2 * 24 + 12 + words) if kept else 64
         per_row += sum(leaf.size * 8 for leaf in jax.tree.leaves(self._inputs))

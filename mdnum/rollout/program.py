@@ -29,13 +29,13 @@ Loss = Callable[[Simulation, Float[np.ndarray, "atoms 3"], Float[np.ndarray, "at
 
 
 def squared_displacement(simulation: Simulation, x: np.ndarray, v: np.ndarray) -> float:
-    """Return the mean squared displacement (length²) from the start. It is the default loss."""
+    """Return the mean squared displacement (length²) from the start, the default loss."""
     return float(np.mean(np.sum((x - simulation.positions) ** 2, axis=1)))
 
 
 @dataclass(frozen=True)
 class MdProgram:
-    """A simulation with an initial state. Its atoms and axes are mapped to another simulation."""
+    """A simulation with an initial state. The atoms and axes are mapped to another simulation."""
 
     simulation: Simulation  # the system as objects
     begin: Start | None = None  # its start; None for the system's own

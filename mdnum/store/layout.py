@@ -1,4 +1,4 @@
-"""Layout of a run folder. A command declares it, and the manifest stores it."""
+"""Layout of a run folder: declared by a command, stored in the manifest."""
 
 from __future__ import annotations
 

@@ -122,7 +122,7 @@ class TaskEngine:
 
 
 def _local(workers: int | None) -> TaskEngine:
-    """Return an engine of local processes. They do not import the user's main script."""
+    """Return an engine of local processes. Worker processes do not import the user's main script."""
     from loky import get_reusable_executor  # noqa: F401 (its pool starts processes by fork and exec)
     from loky.backend import resource_tracker
     from loky.backend.context import get_context

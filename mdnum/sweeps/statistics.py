@@ -1,9 +1,9 @@
 """Means over random seeds, and differences between settings, each with its statistical error.
 
-The error of a run's mean is estimated from autocorrelation. It is also estimated from the scatter of means
-over random seeds. Errors from autocorrelation have many degrees of freedom. They are too small if a mode
-relaxes more slowly than the run lasts. They are therefore multiplied by one factor. The scatter of means over
-all seeds and settings determines this factor.
+The error of a run's mean is estimated from autocorrelation. A second estimate uses the scatter of means over
+random seeds. Errors from autocorrelation have many degrees of freedom. Such errors are too small if the run
+is shorter than the slowest relaxation. Each error is therefore multiplied by one factor. The scatter of means
+over all seeds and settings determines this factor.
 """
 
 from __future__ import annotations
@@ -48,8 +48,8 @@ def estimates(found: Mapping[K, Sequence[tuple[float, float, float]]]) -> dict[K
 
     The error of each mean is estimated from its runs, and then multiplied by a ratio. The ratio is the
     observed scatter between seeds, divided by the scatter expected from these errors. All settings of a
-    measure have the same ratio. More settings make it more precise. The scatter between the seeds of one
-    setting is used instead if it has more degrees of freedom.
+    measure have the same ratio. More settings make the ratio more precise. The scatter between the seeds of
+    one setting is used instead if it has more degrees of freedom.
 
     Args:
         found: (value, standard error, independent samples) of each run; nan if unknown.
@@ -76,7 +76,7 @@ def estimates(found: Mapping[K, Sequence[tuple[float, float, float]]]) -> dict[K
 
 
 class _Runs(NamedTuple):
-    """Variance of a mean over runs, from their errors and from their scatter. It is nan if unknown."""
+    """Variance of a mean over runs, from their errors and from their scatter. An unknown variance is nan."""
 
     runs: int
     within: float
@@ -175,7 +175,7 @@ def _quantile(chance: float, freedom: float) -> float:
 def corrected(raw: Mapping[Name, tuple[float, float, float]]) -> dict[Name, Difference]:
     """Add p-values, corrected for multiple comparisons (Holm 1979), to differences with known errors.
 
-    A difference with unknown degrees of freedom (nan) gets no p-value. It does not count as a comparison.
+    A difference with unknown degrees of freedom (nan) gets no p-value and is not counted.
     """
     from scipy.special import stdtr
 

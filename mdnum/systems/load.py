@@ -491,7 +491,7 @@ def _ball(spec: BallSpec, source: Source) -> BallSystem:
 
 
 def json_schema(file: str) -> dict[str, Any]:
-    """Return the JSON schema of system files. Editors use it to check and complete keys."""
+    """Return the JSON schema of system files. Editors use the schema to check and complete keys."""
     root, title = (BallSpec, " of the ball") if file == BALL_SCHEMA else (schema.SystemSpec, "")
     return {
         "$schema": "https://json-schema.org/draft/2020-12/schema",

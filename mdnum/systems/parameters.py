@@ -1,7 +1,7 @@
 """Parameters of a simulation: their paths, values and units, and how to change them.
 
-A parameter is a number or an array of numbers. Its name is a path. Paths are keys of a system file
-("potential.sigma", "cutoff.radius", "dynamics.timestep"). They may also lead to a component of a potential
+A parameter is a number or an array of numbers. The name of a parameter is a path. Paths are keys of a system
+file ("potential.sigma", "cutoff.radius", "dynamics.timestep"). Other paths lead to a component of a potential
 ("potential.layers.0.weight"). A single array entry is also a parameter, such as "potential.pairs.Ni-P.sigma"
 or "position.17.x". Further examples are "velocity.17.x" and "potential.layers.0.weight.3.2" (a path with
 indices).
@@ -169,7 +169,7 @@ def unit(simulation: Simulation, name: str) -> str:
 
 
 def value(simulation: Simulation, name: str) -> Float[np.ndarray, "..."]:
-    """Return the value of a parameter. It is a scalar if there is only one pair type."""
+    """Return the value of a parameter, a scalar if there is only one pair type."""
     place = entry(simulation, name)
     if place.index:
         return np.asarray(value(simulation, place.whole)[place.index] * place.factor)
@@ -289,7 +289,7 @@ def _with(simulation: Simulation, name: str, new: np.ndarray) -> Simulation:
 
 
 def _heated(simulation: Simulation, new: float) -> Simulation:
-    """Set the temperature of initial velocities. They are drawn again, or scaled if they were changed."""
+    """Set the temperature of initial velocities: draw new velocities, or scale changed ones."""
     old = simulation.draw
     heated = replace(simulation, draw=replace(old, temperature=new))
     if not (old.temperature and old.drawn) and "temperature" in simulation.integrator.numbers():

@@ -235,7 +235,7 @@ class Simulation:
         return len(self.decider.r_cut) // self.channels
 
     def type_of(self, i, j) -> Int[np.ndarray, "..."]:
-        """Return an index for each pair of atoms. It depends on both species and the channel (cutoff).
+        """Return an index for each pair of atoms. The index depends on both species and the channel (cutoff).
 
         Args:
             i: index of the first atom, plus the number of atoms times the index of the channel.

@@ -487,8 +487,8 @@ def _apart(
 ) -> tuple[Separation, float]:
     """Return each atom's distance between two files without a common shift, and an error bound.
 
-    A common shift is removed only if it explains nearly all of the distances. It can result from different
-    origins, or from removed center-of-mass motion in one file.
+    A common shift is removed only if it explains nearly all of the distances. Different origins cause a
+    common shift, or removed center-of-mass motion in one file.
     """
     now = separation(a, b, atoms)
     allowed = sum(side.position_bound(now.periods) for side in sides)

@@ -2,7 +2,7 @@
 
 A rule is *symmetric* if i and j are neighbors of each other. In a *directed* rule, j may be a neighbor of i
 although i is not a neighbor of j. Squared distances are compared in float64. Every decision has a margin, a
-length that is positive for neighbors. For two atoms at distance r, it is:
+length that is positive for neighbors. Margins of two atoms at distance r:
 
     CutoffRule      r_cut - r
     SpeciesCutoffs  r_cut of the two species - r
@@ -52,7 +52,7 @@ class _Membership:
 
     @property
     def shortest(self) -> float:
-        """Smallest cutoff radius (length). It is infinite if the neighbors are the k nearest atoms."""
+        """Smallest cutoff radius (length). Infinite if the neighbors are the k nearest atoms."""
         return self.reach
 
     def table(

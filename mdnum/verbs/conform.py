@@ -382,7 +382,7 @@ def _evidence(view: View) -> Iterator[str]:
 
 
 def _failures(summary: Mapping[str, Any]) -> Iterator[Finding]:
-    """Yield one finding per failure code. It names another failure that may be the cause."""
+    """Yield one finding per failure code. A finding names another failure that may be the cause."""
     by_code: dict[str, list[Mapping[str, Any]]] = {}
     for row in summary["failures"]:
         by_code.setdefault(row["code"], []).append(row)

@@ -1,7 +1,7 @@
 """`mdnum ball --demo`: short demonstrations of numerical effects, with tested claims.
 
-A demonstration is a script `NN_its_name.py` in the folder `demos`. Its first line states the subject. Its
-function `run()` returns a `Demo`.
+A demonstration is a script `NN_its_name.py` in the folder `demos`. The script's first line states the
+subject. The script's function `run()` returns a `Demo`.
 """
 
 from __future__ import annotations

@@ -700,7 +700,7 @@ def _as_asked(row: dict[str, Any], classes: Classes, groups: Groups) -> dict[str
 
 
 def _flux(one: Followed, flips: int, steps: Mapping[str, Any], found: Pass) -> dict[str, Any] | None:
-    """Estimate the rate of cutoff crossings from velocities. Compare it with the observed flip rate."""
+    """Compare the observed flip rate with the crossing rate that velocities predict."""
     duration = steps["last_time"] - steps["first_time"]
     if not one.flux or not steps["timed"] or not duration > 0 or found.odd is not None:
         return None

@@ -137,7 +137,7 @@ class ComparisonView(FlipsView):
         return self.length(float(table["furthest"][at])), self.length(float(table["bound"][at]))
 
     def frame(self, at: int | None) -> str:
-        """Format the index of a frame. Its numbers in the two files are added if they differ."""
+        """Format the index of a frame. Frame numbers are added if the two files differ."""
         if at is None:
             return "no frame"
         a, b = (int(self.table("apart")[f"number_{one}"][at]) for one in "ab")

@@ -146,7 +146,7 @@ class HeldRows:
 
 
 class FlipsView(View):
-    """Read access to a folder of flips. It formats times and lengths with their units."""
+    """Read access to a folder of flips, with times and lengths formatted in their units."""
 
     @property
     def timed(self) -> bool:
@@ -189,8 +189,8 @@ class FlipsView(View):
     def life(self, one: Mapping[str, Any], name: str = "median", of: str = "lifetime") -> str:
         """Format a contact lifetime: a value, a bound, or why it is unknown.
 
-        A median lifetime of one frame is only an upper bound. Pairs then crossed the cutoff several times
-        between frames.
+        A median lifetime of one frame is only an upper bound. Pairs with shorter lifetimes crossed the cutoff
+        several times between frames.
         """
         life = one[of]
         if not one["pairs_most"]:

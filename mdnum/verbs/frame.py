@@ -74,7 +74,7 @@ class View:
 
     @cached_property
     def system(self) -> Mapping[str, Any]:
-        """Tables in the system file of the run. They are empty if there is no system."""
+        """Tables in the system file of the run. Empty if there is no system."""
         return self.folder.system
 
     @cached_property
@@ -218,7 +218,7 @@ def content(verb: str, asked: Mapping[str, Any]) -> str:
     """Return a digest of the arguments of a verb: 16 hexadecimal digits, the same in every process.
 
     The digest covers the content of a system, the bytes of a file, the manifest of a run folder, and the
-    values of other arguments. It also covers the version of mdnum.
+    values of other arguments. The version of mdnum is also included.
 
     Raises:
         InputError: an argument has no plain value, such as a function.
@@ -343,7 +343,7 @@ def finish(
     view: View | None = None,
     write: bool = True,
 ) -> Outcome:
-    """Judge a folder. Add the findings to its summary.json, and write its report page.
+    """Judge a folder. Add the findings to summary.json, and write the report page.
 
     Args:
         result: result of the verb's computation, for a caller in Python.

@@ -24,8 +24,8 @@ _INFO = {"charge": 1, "spin": 2, "total_charge": 1, "multiplicity": 2}
 class CallerCheck(AuditCheck):
     """Does a calculator detect in-place changes of its input, without modifying its caller's data?
 
-    The check changes an `Atoms` object in place. It also tests the returned arrays and the global random
-    number generators.
+    The check changes an `Atoms` object in place. The returned arrays and the global random number generators
+    are tested, too.
     """
 
     name, title, order, calls = "caller", "Caller", 30, 280
@@ -105,7 +105,7 @@ def _edited(
 
 
 def _buffers(subject: CalculatorSubject, atoms: Atoms) -> Iterator[Observed]:
-    """Test that returned arrays stay unchanged. Writing to them must affect no later result."""
+    """Test that returned arrays stay unchanged, and that later results do not depend on them."""
     used, there = subject.fresh(), atoms.copy()
     used.copies = False
     used.both(there)

@@ -489,7 +489,7 @@ def turned(atoms: Atoms, rng: np.random.Generator) -> Iterator[Same]:
 
 
 def without_periods(atoms: Atoms) -> Iterator[Same]:
-    """Yield a cluster in several nonperiodic cells. All must give the same energy and forces."""
+    """Yield a cluster in several nonperiodic cells. All cells must give the same energy and forces."""
     base = modified(atoms, cell=np.zeros((3, 3)), pbc=False)
     span = np.ptp(base.positions, axis=0).max() + 30.0
     for what, cell in (

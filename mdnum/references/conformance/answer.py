@@ -1,6 +1,6 @@
 """Convert the pairs that a neighbor list returns to named arrays.
 
-This file is copied into the scripts that reproduce a failure. It requires only numpy.
+This file is copied into the scripts that reproduce a failure. The file requires only numpy.
 """
 
 from __future__ import annotations
@@ -51,12 +51,12 @@ def read(given: Any) -> ListAnswer:
     """Return the pairs in a neighbor list's return value as a `ListAnswer`.
 
     A neighbor list may return (i, j), (i, j, shift), (i, j, shift, distance) or (i, j, shift, distance,
-    vector). It may also return i and j with some of the optional arrays. The arrays are recognized by shape.
-    An array with one number per row contains distances. The first array with three integers per row contains
-    shifts. Another array with three numbers per row contains vectors. A mapping with the keys i, j, shift,
-    distance and vector is also accepted, or an object with these attributes. A list of tuples (i, j) is
-    accepted, too, or one array with a row (i, j) for each pair. A Python list of lists is always read as
-    arrays, not as pairs.
+    vector). A subset of the optional arrays is also accepted. The arrays are recognized by shape. An array
+    with one number per row contains distances. The first array with three integers per row contains shifts.
+    Another array with three numbers per row contains vectors. A mapping with the keys i, j, shift, distance
+    and vector is also accepted, or an object with these attributes. A list of tuples (i, j) is accepted, too,
+    or one array with a row (i, j) for each pair. A Python list of lists is always read as arrays, not as
+    pairs.
 
     Raises:
         Malformed: the value has none of the supported forms.

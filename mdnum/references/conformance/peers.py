@@ -1,8 +1,8 @@
 """Neighbor searches of libraries, found by name or `module:function`.
 
-Every function and class here imports what it needs and uses nothing else in the module. Its source is copied
-into scripts that reproduce a failure without mdnum. Each function calls its library as a user would. Unusual
-input is passed on unchanged.
+Every function and class here imports what it needs and uses nothing else in the module. The source of each is
+copied into scripts that reproduce a failure without mdnum. Each function calls its library as a user would.
+Unusual input is passed on unchanged.
 """
 
 # pyright: reportOptionalMemberAccess=false, reportOptionalCall=false
@@ -94,7 +94,7 @@ def ase_neighbor_list(positions, cell, pbc, r_cut):
 
 @peer("ase-skin")
 class AseSkinList:
-    """The class ase.neighborlist.NeighborList of ASE. It adds a skin to the radius of each atom."""
+    """The class ase.neighborlist.NeighborList of ASE. A skin is added to the radius of each atom."""
 
     kept = pbc = None
 
@@ -135,7 +135,7 @@ def ase_primitive_list(positions, cell, pbc, r_cut):
 
 @peer("vesin", "vesin-half")
 def vesin_cells(positions, cell, pbc, r_cut, half=False):
-    """The cell list of vesin. It lists every pair once for each of its two atoms."""
+    """The cell list of vesin, with every pair once for each of its two atoms."""
 
     from vesin import NeighborList
 
