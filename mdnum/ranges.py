@@ -1,4 +1,4 @@
-"""Ranges of the numbers in a run, and floating-point formats that are too narrow for these numbers."""
+"""Ranges of the numbers in a run, and too narrow floating-point formats."""
 
 from __future__ import annotations
 
@@ -12,16 +12,16 @@ DTYPES = {name: np.dtype(name) for name in ("float16", "bfloat16", "float32", "f
 
 
 def smallest(name: str) -> float:
-    """Return the smallest positive number of a format that arithmetic does not flush to zero."""
+    """Return the smallest positive number that is not flushed to zero."""
     limits = ml_dtypes.finfo(DTYPES[name])
     # XLA on a CPU flushes subnormals to zero in every format but float16, whose arithmetic it does in float32
     return float(limits.smallest_subnormal if name == "float16" else limits.smallest_normal)
 
 
 def columns(quantities: Mapping[str, Any]) -> dict[str, np.ndarray]:
-    """Return columns with the largest and the smallest magnitude in each row of the given arrays.
+    """Return columns with the largest and the smallest magnitude of each row.
 
-    `largest_NAME` is the largest magnitude in a row, `smallest_NAME` the smallest nonzero magnitude (or NaN).
+    `largest_NAME` is the largest magnitude. `smallest_NAME` is the smallest nonzero magnitude (or NaN).
     """
     made = {}
     for name, values in quantities.items():

@@ -1,7 +1,7 @@
 """Reading of files with ASE and MDAnalysis, with one-line error messages.
 
-The readers of ASE and MDAnalysis can raise any Python exception, with a message of many lines or without a
-message. `reading` converts each exception to a one-line error that names the file and the frame.
+The readers of ASE and MDAnalysis can raise any exception, even without a message. `reading` converts each
+exception to one line with the file and the frame.
 """
 
 from __future__ import annotations
@@ -70,7 +70,7 @@ _PATIENCE = 10_000
 
 
 class FrameError(InputError):
-    """Raised if a frame contains impossible data; `frame` is the number of the frame in the file, from 0."""
+    """Raised if a frame contains impossible data. `frame` is its number in the file, from 0."""
 
     def __init__(self, message: str, *, frame: int, remedy: str | None, where: str | None = None):
         super().__init__(message, remedy=remedy, where=where)
@@ -82,11 +82,11 @@ class FrameError(InputError):
 
 
 class EarlierFramesError(FrameError):
-    """Raised if a frame shows that all earlier frames are wrong, so that no result can be kept."""
+    """Raised if a frame shows that all earlier frames are wrong."""
 
 
 class UnreadableFrame(FrameError):
-    """Raised if a frame cannot be read after earlier frames of the file were read."""
+    """Raised if a frame cannot be read, but earlier frames were read."""
 
     def __init__(self, message: str, *, frame: int, where: str, remedy: str | None = None):
         before = f"The frames before it were read; to stop there add @:{frame} to the path"
@@ -97,7 +97,7 @@ class UnreadableFrame(FrameError):
 def reading(
     file: str | Path, frame: int | None = None, *, by: str = "MDAnalysis", remedy: str = CHECK
 ) -> Iterator[None]:
-    """Context manager that converts exceptions of a reader to one-line errors, and suppresses warnings.
+    """Context manager that turns exceptions of a reader into one-line errors, and suppresses warnings.
 
     Args:
         file: the file that is read.
@@ -144,7 +144,7 @@ def reading(
 
 
 def check_claim(path: str | Path, atoms: int | None = None) -> None:
-    """Raise an error if a file claims an impossible number of atoms, before a reader allocates memory.
+    """Raise an error if a file claims an impossible number of atoms.
 
     Args:
         path: the file.
@@ -168,7 +168,7 @@ def check_claim(path: str | Path, atoms: int | None = None) -> None:
 
 
 def whole_text(file: str | Path | BinaryIO, where: str | Path) -> str:
-    """Return the whole text of a UTF-8 file; raise an error if the file is too large for memory.
+    """Return the whole text of a UTF-8 file. Raise an error if it exceeds the memory.
 
     Raises:
         InputError: the file is too large. OSError, UnicodeDecodeError: the file cannot be read.
@@ -206,7 +206,7 @@ def first_line(error: BaseException) -> str:
 
 
 class _Lines(io.TextIOWrapper):
-    """A text file that raises an error if a reader repeatedly reads beyond the end of the file."""
+    """A text file that raises an error at repeated reads beyond its end."""
 
     _at_end = 0
 
@@ -254,7 +254,7 @@ def ase_images(
 
 
 def with_elements(atoms: Any) -> Atoms:
-    """Return the atoms; raise an error if an atom has an invalid atomic number (0 is allowed).
+    """Return the atoms. Raise an error for an invalid atomic number (0 is allowed).
 
     Raises:
         ValueError: an atomic number is negative, or too large for ASE's table of elements.
@@ -270,9 +270,9 @@ def with_elements(atoms: Any) -> Atoms:
 
 
 def ignored_velocities(arrays: Mapping[str, np.ndarray]) -> list[str]:
-    """Return the names of columns that look like velocities or momenta, but are not read as such.
+    """Return the names of columns that look like velocities or momenta, but are not read.
 
-    Extended XYZ defines only momenta, in ASE's units; the units of other columns are unknown.
+    Extended XYZ defines only momenta, in ASE's units. Other columns have unknown units.
     """
     shapes = {name: array.shape[1:] for name, array in arrays.items() if _VELOCITY.fullmatch(name)}
     return sorted(name for name, shape in shapes.items() if shape in ((3,), ()) and name != "momenta")

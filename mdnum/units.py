@@ -23,7 +23,7 @@ class Units:
     """Unit labels and conversion factors of a unit system.
 
     Internally, lengths, energies and masses have the units of the system file. The unit of time is length *
-    sqrt(mass / energy), so that acceleration = force / mass without a conversion factor.
+    sqrt(mass / energy). Then, acceleration = force / mass.
 
     Attributes:
         time_factor: user time * time_factor = internal time.
@@ -57,7 +57,7 @@ FORCE = f"{ENERGY}/{LENGTH}"
 
 
 def named(quantity: str, units: Mapping[str, Any]) -> str:
-    """Replace quantities ("energy/length") by names of units ("eV/Å"); return "" if a name is missing.
+    """Replace quantities ("energy/length") by units ("eV/Å"). Return "" if a name is missing.
 
     A text without names of quantities, such as "kcal/mol", is returned unchanged.
 
@@ -70,7 +70,7 @@ def named(quantity: str, units: Mapping[str, Any]) -> str:
 
 @dataclass(frozen=True)
 class Measured:
-    """A measured number with its unit, its noise level, and a reference value for comparison."""
+    """A measured number with its unit, its noise level and a reference value."""
 
     value: float
     unit: str = ""  # of names ("eV/Å") or, until it is written, of quantities ("energy/length")
@@ -79,18 +79,18 @@ class Measured:
 
     @property
     def found(self) -> bool:
-        """True if the magnitude of the number exceeds the noise level, or if the number is NaN."""
+        """True if the magnitude exceeds the noise level, or the number is NaN."""
         return self.floor is None or not abs(self.value) <= self.floor
 
     @property
     def digits(self) -> str:
-        """The number as text, rounded to the digits that are significant at its noise level."""
+        """The number as text, with the digits that are significant at its noise level."""
         if self.floor is None or self.floor < 1e-12:
             return repr(float(self.value))
         return f"{self.value:.{min(max(math.ceil(-math.log10(self.floor)), 1), 15)}f}"
 
     def to(self, prefix: str, units: Mapping[str, Any] = MappingProxyType({})) -> Measured:
-        """Convert the number to a unit with a prefix ("m" for milli); `units` contains the names of units."""
+        """Convert the number to a unit with a prefix ("m" for milli). `units` names the units."""
         unit = named(self.unit, units) or self.unit
         size = {"": 1.0, "m": 1e3}[prefix]
         scaled = {name: size * part for name, part in vars(self).items() if isinstance(part, float)}
@@ -98,7 +98,7 @@ class Measured:
 
 
 def revived(value: Any) -> Any:
-    """Restore a `Measured` from a dictionary read from JSON; return any other value unchanged."""
+    """Restore a `Measured` from a JSON dictionary. Return other values unchanged."""
     names = {each.name for each in fields(Measured)}
     return Measured(**value) if isinstance(value, dict) and value.keys() == names else value
 

@@ -1,11 +1,11 @@
-"""Search for discontinuities of the energy of many atoms, with moving atoms and dense clusters.
+"""Search for discontinuities of the energy of many atoms.
 
-In a many-body potential, the interaction of a pair depends on other atoms. The energy may then jump at a
-threshold where it is smooth for two isolated atoms. Atoms and triples of atoms are therefore moved through
-all pair thresholds, and also through other distances. To detect a limit on the number of neighbors, one more
-atom is moved past all neighbors of a crowded central atom. If a calculator keeps only k neighbors, the energy
-or a force jumps where the moving atom and the k-th neighbor are equally far away. If a calculator keeps the
-first k neighbors in the order of the list, reordering the atoms reveals the limit.
+In a many-body potential, the interaction of a pair depends on other atoms. The energy may jump at a threshold
+where two isolated atoms have a smooth energy. Therefore, atoms and triples of atoms are moved through all
+pair thresholds and other distances. To detect a limit on the number of neighbors, an atom is moved past the
+neighbors of a crowded atom. If only k neighbors are kept, the energy or a force jumps where the moving atom
+is as far away as the k-th neighbor. If only the first k neighbors of the list are kept, reordering the atoms
+reveals the limit.
 """
 
 from __future__ import annotations
@@ -49,7 +49,7 @@ _HABITUAL = (12, 16, 20, 24, 30, 32, 40, 48, 50, 60, 64, 80, 96, 100, 120, 128, 
 
 
 class RouteCrossing(NamedTuple):
-    """A point on a route at which the distance from the moving atom to another atom crosses a threshold."""
+    """A point on a route at which the moving atom crosses a threshold distance."""
 
     at: float
     threshold: PairThreshold
@@ -57,7 +57,7 @@ class RouteCrossing(NamedTuple):
 
 @dataclass(frozen=True)
 class Route:
-    """A structure in which one or several atoms move along a straight line (a route)."""
+    """A structure in which one or several atoms move along a straight line."""
 
     name: str
     atoms: Atoms  # the structure at 0
@@ -66,13 +66,13 @@ class Route:
     direction: Float[np.ndarray, "3"]  # unit vector
 
     def at(self, along: float) -> Atoms:
-        """Return the structure with its moving atoms displaced by a given length along the route."""
+        """Return the structure with its moving atoms displaced along the route."""
         atoms = self.atoms.copy()
         atoms.positions[self.moving] += along * self.direction
         return atoms
 
     def curve(self, subject: CalculatorSubject) -> Curve:
-        """Energy along the route, and the force on the moving atoms in the direction of the route."""
+        """Energy along the route, and the force on the moving atoms along the route."""
 
         def at(along: float) -> tuple[float, float]:
             energy, forces = subject.both(self.at(along))
@@ -81,9 +81,9 @@ class Route:
         return Curve(at)
 
     def crossings(self, thresholds: Sequence[PairThreshold], low: float, high: float) -> list[RouteCrossing]:
-        """Return the points between `low` and `high` at which the moving atom crosses a threshold distance.
+        """Return the points between `low` and `high` at which a threshold is crossed.
 
-        The squared distance along a line is quadratic, so the crossings are roots of quadratic equations.
+        The crossings are roots of quadratic equations.
         """
         found: list[RouteCrossing] = []
         symbols = np.array(self.atoms.get_chemical_symbols())
@@ -101,13 +101,13 @@ class Route:
         return sorted(found, key=lambda one: one.at)
 
     def ties(self, along: float) -> tuple[tuple[int, int], ...]:
-        """Return (atom, k) for each atom whose k-th and (k+1)-th neighbors swap at a point of the route."""
+        """Return (atom, k) for each atom whose k-th and (k+1)-th neighbors swap."""
         return exchanged(self.at(along - _TIED), self.at(along + _TIED))
 
 
 @dataclass(frozen=True)
 class Event:
-    """A point on a route at which the energy or one of its derivatives jumps."""
+    """A point on a route at which the energy or a derivative jumps."""
 
     route: str  # its name
     at: float  # place along it, length
@@ -132,7 +132,7 @@ class EnvironmentWalks:
 
     @property
     def lower(self) -> list[Event]:
-        """Crossings of pair thresholds at which the energy is less smooth than for two isolated atoms."""
+        """Crossings at which the energy is less smooth than for two isolated atoms."""
         return [one for one in self.events if one.threshold and one.jump.order < min(one.threshold.order, 2)]
 
 
@@ -143,7 +143,7 @@ def walk_surroundings(
     crossings: int = _CROSSINGS,
     routes: int = _ROUTES,
 ) -> EnvironmentWalks:
-    """Move atoms and triples of atoms through known pair thresholds, and search for unknown thresholds.
+    """Move atoms and triples of atoms through known pair thresholds. Search for unknown ones.
 
     Args:
         crossings: number of crossings of known thresholds that are measured in the structure.
@@ -185,12 +185,12 @@ def walk_surroundings(
 
 
 def _groups(atoms: Atoms, single: bool) -> list[np.ndarray]:
-    """Return the groups of atoms that move together: single atoms if `single`, else whole molecules."""
+    """Return the groups of atoms that move together: single atoms or whole molecules."""
     return [np.array([k]) for k in range(len(atoms))] if single else molecules(atoms)
 
 
 def _cut_out(atoms: Atoms, groups: Sequence[np.ndarray], pair: Pair) -> Atoms:
-    """Return a cluster of the atom groups nearest to the first group, in the cell of the particle pair."""
+    """Return a cluster of the groups nearest to the first group, in the pair's cell."""
     center = _lead(atoms, groups[0])
     offsets = atoms.get_distances(center, np.arange(len(atoms)), mic=bool(atoms.pbc.any()), vector=True)
     nearest = np.argsort([np.linalg.norm(offsets[_lead(atoms, group)]) for group in groups])
@@ -210,7 +210,7 @@ def _lead(atoms: Atoms, group: np.ndarray) -> int:
 def _targeted(
     atoms: Atoms, thresholds: Sequence[PairThreshold], groups: Sequence[np.ndarray]
 ) -> list[tuple[Route, RouteCrossing]]:
-    """Return a few routes for each threshold; on each route, a nearby pair crosses the threshold."""
+    """Return a few routes for each threshold. On a route, a near pair crosses it."""
     of_lead = {_lead(atoms, group): group for group in groups}
     symbols = np.array(atoms.get_chemical_symbols())
     ranked: list[tuple[int, Route, RouteCrossing]] = []
@@ -237,7 +237,7 @@ def _targeted(
 
 
 def _at_crossing(subject: CalculatorSubject, route: Route, crossing: RouteCrossing) -> Event:
-    """Measure the jump at a known threshold; if energy or force jumps, locate the jump exactly."""
+    """Measure the jump at a known threshold. Locate a jump of energy or force exactly."""
     curve, side = route.curve(subject), max(_SIDE, 3 * crossing.threshold.located)
     # what is smooth for two may jump among others: the lowest derivative that does, whatever the threshold
     for row in range(2):
@@ -263,7 +263,7 @@ def _event(
 def _scanned(
     subject: CalculatorSubject, thresholds: Sequence[PairThreshold], route: Route, low: float, high: float
 ) -> list[Event]:
-    """Search a route for thresholds that the scans of atom pairs did not find."""
+    """Search a route for thresholds that scans of atom pairs did not find."""
     curve = route.curve(subject)
     crossings = route.crossings(thresholds, low - 1.0, high + 1.0)
     inside = sum(low <= one.at <= high for one in crossings)
@@ -283,7 +283,7 @@ def _scanned(
 
 
 def _triples(subject: CalculatorSubject) -> list[tuple[Route, float, float]]:
-    """Return (route, start, end) for routes on which an atom approaches two bonded atoms from the side."""
+    """Return (route, start, end) for atoms that approach two bonded atoms from the side."""
     found: list[tuple[Route, float, float]] = []
     for walk in walk_pairs(subject).walks[:_MOST_TRIPLES]:
         bond = float(walk.distance[int(np.argmin(walk.energy))])
@@ -313,7 +313,7 @@ def _random(atoms: Atoms, groups: Sequence[np.ndarray], count: int) -> list[tupl
 
 
 def _rounded(event: Event, quantum: tuple[float, float]) -> bool:
-    """Return whether a jump is due to rounding, for a calculator that returns few decimals."""
+    """Return whether a jump is due to the few decimals of a calculator."""
     if not any(quantum):
         return False
     small = abs(event.jump.energy) <= STEPS * quantum[0] and event.force <= STEPS * quantum[1]
@@ -324,7 +324,7 @@ def _rounded(event: Event, quantum: tuple[float, float]) -> bool:
 
 
 class CrowdOrder(NamedTuple):
-    """Changes of energy and forces when the atoms of a dense cluster are reordered."""
+    """Changes of energy and forces when a dense cluster is reordered."""
 
     # number of neighbors at which it starts to matter, None if it never does
     start: int | None = None
@@ -336,7 +336,7 @@ class CrowdOrder(NamedTuple):
 
 @dataclass(frozen=True)
 class Crowd:
-    """A central atom with many neighbors, and the energy and force jumps when it gains another neighbor."""
+    """A central atom with many neighbors, and the jumps when it gains another."""
 
     species: str  # of all atoms
     radius: float  # cutoff that the crowd is inside of, length
@@ -351,7 +351,7 @@ class Crowd:
 
 
 def crowd(subject: CalculatorSubject, progress: Progress, ways: Ways, most: int = _MOST) -> list[Crowd]:
-    """Give one atom of each species many neighbors, to detect a limit on the number of neighbors.
+    """Give one atom of each species many neighbors.
 
     Args:
         most: number of neighbors of the central atom.
@@ -379,11 +379,10 @@ def crowd(subject: CalculatorSubject, progress: Progress, ways: Ways, most: int 
 
 
 def cluster(pair: Pair, radius: float, count: int) -> tuple[Atoms, Float[np.ndarray, "neighbors"]]:
-    """Return a central atom at the origin with `count` neighbors at different distances, and these distances.
+    """Return a central atom at the origin, `count` neighbors, and their distances.
 
     The neighbors are evenly spread in angle (golden spiral) and in volume. Random positions would put some
-    neighbors too close together. The central atom is the first atom, followed by the neighbors in order of
-    distance.
+    neighbors too close together. The central atom is first. The neighbors follow in order of distance.
     """
     k = np.arange(count)
     share = (k + 0.5) / count
@@ -399,7 +398,7 @@ def cluster(pair: Pair, radius: float, count: int) -> tuple[Atoms, Float[np.ndar
 
 
 def gap(atoms: Atoms) -> Float[np.ndarray, "3"]:
-    """Return the direction from the central atom that is farthest, in angle, from all neighbors."""
+    """Return the direction from the central atom that is farthest from all neighbors."""
     tried = np.random.default_rng(1).normal(size=(2000, 3))
     tried /= np.linalg.norm(tried, axis=1)[:, None]
     offsets = atoms.positions[1:] - atoms.positions[0]
@@ -420,10 +419,10 @@ def _crowded(subject: CalculatorSubject, walk: PairWalk, count: int, ties: int) 
     side = _SIDE_OF_TIE * float(np.spacing(np.float32(max(np.abs(atoms.positions).max(), radius))))
 
     def change(place: float, without: int | None = None) -> tuple[float, Float[np.ndarray, "atoms"]]:
-        """Return the jumps of energy and forces as an atom moves from `place - side` to `place + side`.
+        """Return the jumps as an atom moves from `place - side` to `place + side`.
 
-        The energy jump is the energy change plus the work of the force. The force jump of an atom is the
-        change of its force minus the mean change over the two adjacent intervals. Both are absolute values.
+        The energy jump is the energy change plus the work of the force. The force jump is the change of force
+        minus the mean change of the two adjacent intervals. Both are absolute values.
         """
         first, before = subject.both(walker(place - side, without))
         second, after = subject.both(walker(place + side, without))
@@ -468,7 +467,7 @@ def _crowded(subject: CalculatorSubject, walk: PairWalk, count: int, ties: int) 
 
 
 def _order(subject: CalculatorSubject, walk: PairWalk, radius: float, most: int) -> CrowdOrder:
-    """Find the smallest number of neighbors for which the order of atoms affects energy or forces."""
+    """Find the smallest number of neighbors at which the order of atoms matters."""
     low, high, changed = 1, None, (0.0, 0.0)
     larger = iter([*(count for count in (4, 16, 64) if count < most), most])
     while count := next(larger, None) if high is None else (low + high) // 2 * (high - low > 1):
@@ -489,9 +488,9 @@ def _order(subject: CalculatorSubject, walk: PairWalk, radius: float, most: int)
 def _permuted(
     subject: CalculatorSubject, walk: PairWalk, radius: float, count: int, aside: bool = False
 ) -> tuple[float, float] | None:
-    """Return the changes of energy and force when atoms are reordered; None if rounding explains the changes.
+    """Return the changes of energy and force when atoms are reordered. None if due to rounding.
 
-    If `aside` is true, the last neighbor is moved so far away that it interacts with no atom.
+    If `aside` is true, the last neighbor is moved until it interacts with no atom.
     """
     atoms, _ = cluster(walk.pair, radius, count)
     if aside:

@@ -1,7 +1,7 @@
 """Gradients in the form that JAX functions return, for training loops.
 
-The host builds neighbor lists during the simulation. Transformations that trace the whole simulation as one
-program (jit, vmap) are therefore not supported.
+The host builds neighbor lists during the simulation. Transformations of the whole simulation (jit, vmap) are
+therefore not supported.
 """
 
 from __future__ import annotations
@@ -67,8 +67,8 @@ def differentiable(
 ) -> Callable[[Values], jax.Array]:
     """Return the loss as a function that JAX can differentiate in reverse mode.
 
-    To differentiate with respect to other variables, such as a pytree, write a function that computes the
-    named values from these variables. Then apply `jax.grad` to the composition.
+    For other variables, such as a pytree, write a function that computes the named values from them. Then
+    apply `jax.grad` to the composition.
 
     Args:
         problem, names, method: as for `value_and_grad`, which also lists errors and warnings.
@@ -118,7 +118,7 @@ def _chosen(problem: Problem, names: Sequence[str], word: Method | str) -> tuple
 
 
 def _differentiated(chosen: Method, problem: Problem, names: tuple[str, ...]) -> Gradient:
-    """Compute the gradient; warn if a derivative is exactly zero, raise an error if one is not finite."""
+    """Compute the gradient. Warn if a derivative is exactly zero. Raise an error if one is not finite."""
     found = chosen(problem, names)
     for name, value in found.gradient.items():
         if not np.any(np.asarray(value)):
@@ -142,7 +142,7 @@ def _differentiated(chosen: Method, problem: Problem, names: tuple[str, ...]) ->
 
 
 def _in_full(problem: Problem, values: Values, full: Sequence[str]) -> dict[str, np.ndarray]:
-    """Convert full or short names of parameters to full names, and return the values by full name."""
+    """Return the values by full name. The given names may be short."""
     out = {}
     for word, value in values.items():
         (name,) = parameters.resolve(problem.simulation, [word])

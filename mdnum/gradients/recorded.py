@@ -231,7 +231,7 @@ class Forward(Method):
 
 @dataclass(frozen=True)
 class Reversible(Method):
-    """Gradient method: derivative at fixed decisions. The run is reversed in time, not stored.
+    """Gradient method: derivative at fixed decisions, with a run reversed in time.
 
     The forward pass stores only the last state. Rounding to integers is differentiated as the identity.
 

@@ -1,6 +1,6 @@
-"""The ASE file format "mdnum" for run folders; ASE imports this module together with its own formats.
+"""The ASE file format "mdnum" for run folders.
 
-The format is not in `ase_plugin`, because ASE imports formats while the module `ase_plugin` is still empty.
+The format is not in `ase_plugin`, because ASE imports formats while `ase_plugin` is still empty.
 """
 
 from __future__ import annotations

@@ -1,6 +1,6 @@
-"""Tables that are written in part files while a run continues, and merged into one file at the end.
+"""Tables that are written in parts during a run, and merged at the end.
 
-In a folder that cannot be resumed, a thread writes each table directly into its final file.
+If a folder cannot be resumed, a thread writes the final file of each table directly.
 """
 
 from __future__ import annotations
@@ -42,8 +42,8 @@ _DISTINCT = frozenset({"i", "j", "distance", "before", "margin", "margin_before"
 class TableStream:
     """A growing table, stored in the files `<name>.parquet` and `parts/<name>-<first row>.parquet`.
 
-    The name of a part file tells which rows the file contains. The rows in each file are therefore known even
-    if the process is killed while it writes, merges or truncates.
+    The name of a part file tells which rows the file contains. The rows in each file are therefore known,
+    even if the process is killed.
     """
 
     def __init__(
@@ -86,13 +86,13 @@ class TableStream:
         return self.flushed + self._buffered
 
     def parts(self) -> list[tuple[int, Path]]:
-        """Return the first row and the path of each part file, in the order of rows."""
+        """Return the first row and the path of each part file."""
         found = self.parts_folder.glob(f"{self.name}-*.parquet")
         named = re.compile(re.escape(self.name) + r"-(\d{12,})\.parquet")
         return sorted((int(match[1]), path) for path in found if (match := named.fullmatch(path.name)))
 
     def files(self) -> list[tuple[Path, int]]:
-        """Return the path and the number of rows of each file of the table, except merged part files."""
+        """Return the path and number of rows of each file of the table. Merged part files are omitted."""
         files: list[tuple[Path, int]] = []
         rows = 0
         if self.merged_path.exists():
@@ -148,7 +148,7 @@ class TableStream:
             self.flush()
 
     def look_up(self, of: str, columns: Mapping[str, Any]) -> None:
-        """Declare columns whose values are looked up from an index when rows are written.
+        """Declare columns whose values are looked up when rows are written.
 
         Args:
             of: name of the column of indices.
@@ -161,7 +161,7 @@ class TableStream:
             self._usual[name] = lambda table, found=found: found.take(table[of])
 
     def flush(self) -> None:
-        """Write the rows in memory as one part file, or pass them to the thread that writes the table."""
+        """Write the rows in memory as a part file, or pass them to the writing thread."""
         if not self._buffered:
             return
         held, schema = together(self._buffer), cast(pa.Schema, self._schema)
@@ -182,7 +182,7 @@ class TableStream:
         self._buffer, self._buffered = [], 0
 
     def truncate(self, rows: int) -> None:
-        """Keep only the first `rows` rows of the table, in memory and on disk."""
+        """Keep the first `rows` rows of the table, in memory and on disk."""
         self._buffer, self._buffered = [], 0
         files = self.files()
         have = sum(count for _, count in files)
@@ -210,7 +210,7 @@ class TableStream:
         self.flushed = rows
 
     def merge(self) -> None:
-        """Write all rows into one file, and remove part files; a table without rows becomes an empty file."""
+        """Write all rows into one file, and remove part files. A table without rows becomes an empty file."""
         self.flush()
         if self._writing is not None:
             self._writing.end()
@@ -236,7 +236,7 @@ class TableStream:
             self._writing = None
 
     def batches(self, columns: Sequence[str] | None = None) -> Iterator[pa.Table]:
-        """Return an iterator over the rows on disk, one file or row group at a time."""
+        """Return an iterator over the rows on disk, in blocks."""
         return (self._whole(table, columns) for table in self._on_disk(columns))
 
     def _on_disk(self, columns: Sequence[str] | None = None) -> Iterator[pa.Table]:
@@ -294,7 +294,7 @@ class TableStream:
             return file.metadata.num_rows
 
     def _replace(self, path: Path, tables: Iterable[pa.Table], schema: pa.Schema) -> None:
-        """Write rows into a file of this table; the manifest lists the file's digest before the file exists.
+        """Write rows into a file. The manifest lists its digest before the file exists.
 
         Every page of the file has a checksum that readers can verify.
         """
@@ -319,7 +319,7 @@ class TableStream:
         self.written[name] = [found]
 
     def _refuse_columns(self, path: Path, schema: pa.Schema, wanted: Sequence[str] | None) -> None:
-        """Raise an error if a file has columns of the wrong type, or does not have the requested columns."""
+        """Raise an error if a file lacks columns, or has columns of the wrong type."""
         found = {field.name: field.type for field in schema}
         other = [name for name, kind in self._known.items() if found.get(name, kind) != kind]
         missing = [name for name in wanted or () if name not in found and name not in self._usual]
@@ -333,7 +333,7 @@ class TableStream:
 
 
 class _Writing:
-    """A file to which a background thread writes queued tables, mostly without holding Python's GIL."""
+    """A file that a background thread writes, mostly without holding Python's GIL."""
 
     def __init__(self, write: Callable[[Iterator[pa.Table]], None]):
         # with a limit: where the disk is slower than what makes the rows, that waits
@@ -350,7 +350,7 @@ class _Writing:
             raise RuntimeError("some rows of the result table were not written to its file")
 
     def put(self, table: pa.Table | None) -> None:
-        """Add a table to the queue when there is room; raise the error of the writing thread, if any."""
+        """Add a table to the queue when there is room. Raise an error of the writing thread."""
         while not self._done.ready():
             with suppress(Full):
                 self._tables.put(table, timeout=1.0)
@@ -358,7 +358,7 @@ class _Writing:
         self._done.get()
 
     def end(self, whole: bool = True) -> None:
-        """Wait until all tables are written, or discard the file and ignore errors if not `whole`."""
+        """Wait until all tables are written. If not `whole`, discard the file and ignore errors."""
         self._whole = whole
         with nullcontext() if whole else suppress(Exception):
             self.put(None)
@@ -367,20 +367,20 @@ class _Writing:
 
 
 def together(parts: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
-    """Concatenate tables with the same columns; a column of equal texts may be given as one text."""
+    """Concatenate tables with the same columns. A column of equal texts may be one text."""
     columns = {name: [part[name] for part in parts] for name in parts[0]}
     return {name: one[0] if isinstance(one[0], str) else np.concatenate(one) for name, one in columns.items()}
 
 
 def _repeats(values: Any, value: Any) -> bool:
-    """Return True if a column consists of one repeated value, stored once, that equals the given value."""
+    """Return True if a column stores one repeated value that equals the given value."""
     if isinstance(values, np.ndarray) and values.strides == (0,):
         values = values[0]
     return value is not None and np.ndim(values) == 0 and bool(values == value)
 
 
 def as_arrow(values: Any, kind: pa.DataType, rows: int = 0) -> pa.Array:
-    """Create an arrow column from buffers, without `pa.array`, which imports pandas (half a second).
+    """Create an arrow column without `pa.array`, which imports pandas (half a second).
 
     Args:
         values: one value per row; one value for all rows; or None for a column of unknown values.
@@ -406,7 +406,7 @@ def as_arrow(values: Any, kind: pa.DataType, rows: int = 0) -> pa.Array:
 
 
 def as_numpy(column: pa.Array | pa.ChunkedArray) -> np.ndarray:
-    """Return an arrow column without nulls as a numpy array, without `to_numpy`, which imports pandas."""
+    """Return an arrow column without nulls as a numpy array, without importing pandas."""
     parts = column.chunks if isinstance(column, pa.ChunkedArray) else [column]
     if pa.types.is_string(column.type):
         return np.array([text for part in parts for text in part.to_pylist()], object)
@@ -427,7 +427,7 @@ def as_numpy(column: pa.Array | pa.ChunkedArray) -> np.ndarray:
 
 @contextmanager
 def _parquet(path: Path) -> Iterator[pq.ParquetFile]:
-    """Open a parquet file; the checksum of each page is verified when the page is read."""
+    """Open a parquet file. The checksum of each page is verified when it is read."""
     try:
         with opened(path) as raw, pq.ParquetFile(raw, page_checksum_verification=True) as file:
             head, size = file.metadata, os.fstat(raw.fileno()).st_size

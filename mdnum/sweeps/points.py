@@ -1,4 +1,4 @@
-"""Storage of a sweep's points: one folder per point, named by a hash of the data that define the point.
+"""Storage of a sweep's points: one folder per point, named by a hash.
 
     sweep/
       .signac/config                  a signac workspace
@@ -8,10 +8,10 @@
         series.parquet                values at each step
       claims/ADDRESS.N                the process that is computing it
 
-The address (folder name) of a point is the MD5 hash of its state point as JSON, as in signac. A point is
-computed in a temporary folder, which is then renamed. A killed process therefore leaves no partial
-result. To claim a point of a sweep, a process creates a file with O_EXCL, so that only one process succeeds.
-If the claiming process ends without a result, another process creates a claim with the next number.
+The address (folder name) of a point is the MD5 hash of its state point, as in signac. A point is computed in
+a temporary folder, which is then renamed. A killed process therefore leaves no partial result. To claim a
+point, a process creates a file with O_EXCL. Only one process succeeds. If the process ends without a result,
+another process creates the next claim.
 """
 
 from __future__ import annotations
@@ -53,7 +53,7 @@ _ARITHMETIC = ("jax", "jaxlib", "numpy", "llvmlite")
 
 @cache
 def code(everywhere: bool = False) -> str:
-    """Return a digest of the source code that computes points, and of the versions of numerical packages.
+    """Return a digest of the source code of points, and of the versions of numerical packages.
 
     Args:
         everywhere: whether to include all source code of mdnum.
@@ -82,7 +82,7 @@ def digest(places: Sequence[str]) -> str:
 def state_point(
     program: Mapping[str, Any], structure: str | None, asked: Mapping[str, Any]
 ) -> dict[str, Any]:
-    """Return the state point, the data that define a point: parameters of the system, structure, and run.
+    """Return the state point: the parameters of system, structure and run that define a point.
 
     Args:
         program: the program of a system (`System.program`); entries that are None are omitted. structure:
@@ -93,7 +93,7 @@ def state_point(
 
 
 def _given(tables: Any) -> Any:
-    """Remove entries that are None, and replace dots in keys by "-", since signac does not allow dots."""
+    """Remove entries that are None. Replace dots in keys by "-", as signac allows no dots."""
     if not isinstance(tables, dict):
         return tables
     return {key.replace(".", "-"): _given(one) for key, one in tables.items() if one is not None}
@@ -133,7 +133,7 @@ class Workspace:
         return self.place / address
 
     def result(self, address: str) -> dict[str, Any] | None:
-        """Return the stored result of a point, or None if the point was not computed yet.
+        """Return the stored result of a point. None if it was not computed yet.
 
         Raises:
             FolderError: the file with the result is damaged.
@@ -150,7 +150,7 @@ class Workspace:
             ) from None
 
     def nearest(self, point: Mapping[str, Any]) -> list[str] | None:
-        """Return the fields in which a point differs from the most similar stored point, or None."""
+        """Return the fields in which a point differs from the nearest stored point, or None."""
         best: list[str] | None = None
         for file in self.place.glob(f"*/{STATE_POINT}"):
             with suppress(OSError, ValueError):
@@ -161,16 +161,16 @@ class Workspace:
     # --- claims -------------------------------------------------------------------------------------------
 
     def claims(self, address: str = "*") -> list[tuple[Path, int]]:
-        """Return the claim files of a point, or of all points, with their numbers in ascending order."""
+        """Return the claim files of one or all points, in the order of their numbers."""
         found = [(file, _CLAIM.fullmatch(file.name)) for file in self._held.glob(f"{address}.*")]
         numbered = [(file, int(match["number"])) for file, match in found if match]
         return sorted(numbered, key=lambda one: (one[0].stem, one[1]))
 
     @contextmanager
     def claimed(self, address: str) -> Iterator[bool]:
-        """Context manager: claim a point for this process, and yield whether the claim succeeded.
+        """Context manager: claim a point for this process. Yield whether this succeeded.
 
-        After a claim, check again for a result: another process may have finished the point just before.
+        After a claim, check again for a result. Another process may have finished the point.
         """
         claim = self._claim(address)
         if claim is None:
@@ -221,7 +221,7 @@ class Workspace:
 
     @contextmanager
     def filling(self, address: str, point: Mapping[str, Any]) -> Iterator[Path]:
-        """Yield an empty folder, which becomes the point's folder unless the `with` block raises an error."""
+        """Yield an empty folder. It becomes the point's folder if the `with` block raises no error."""
         here = self.place / f".{address}.{socket.gethostname()}.{os.getpid()}"
         shutil.rmtree(here, ignore_errors=True)
         with disk_errors(here):
@@ -246,7 +246,7 @@ class Workspace:
                 os.replace(file, target / file.name)
 
     def swept(self) -> int:
-        """Remove unfinished folders of processes that no longer exist; return the number of folders."""
+        """Remove unfinished folders of ended processes. Return their number."""
         count = 0
         # folders before claims: whoever makes a folder has claimed its point before
         for folder in [one for one in self.place.glob(".*.*.*") if one.is_dir()]:
@@ -265,21 +265,21 @@ def write_result(folder: Path, found: Mapping[str, Any]) -> None:
 
 
 def me() -> dict[str, Any]:
-    """Return the data that identify this process in claim files: host, boot, process ID and start time."""
+    """Return the data of this process in claim files: host, boot, process ID and start time."""
     pid = os.getpid()
     return {"host": socket.gethostname(), "boot": boot(), "pid": pid, "since": born(pid), "at": time.time()}
 
 
 @cache
 def boot() -> str:
-    """Return the identifier of this machine's current boot; empty if the identifier is not available."""
+    """Return the identifier of this machine's boot. Empty if not available."""
     with suppress(OSError):
         return Path("/proc/sys/kernel/random/boot_id").read_text(encoding="ascii").strip()
     return ""
 
 
 def born(pid: int) -> str | None:
-    """Return the start time of a local process in ticks; None if it does not exist, "" if unknown."""
+    """Return the start time of a local process in ticks. None if it does not exist, "" if unknown."""
     try:
         os.kill(pid, 0)
     except ProcessLookupError:
@@ -295,9 +295,9 @@ def born(pid: int) -> str | None:
 
 
 def gone(claim: Path) -> bool:
-    """True if the process that made a claim has ended, or if its machine was restarted.
+    """True if the process of a claim has ended, or its machine was restarted.
 
-    A process on another machine counts as ended if its claim file is older than three minutes.
+    A process on another machine counts as ended if its claim is older than three minutes.
     """
     try:
         silent = time.time() - claim.stat().st_mtime

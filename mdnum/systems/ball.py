@@ -1,4 +1,4 @@
-"""Schema of a system file of a bouncing ball (`world = "ball"`): pydantic models with units.
+"""Schema of a system file of a bouncing ball (`world = "ball"`).
 
 Heights are in m, velocities in m/s, times in s. Stiffness and damping are per mass (1/s², 1/s), so no mass is
 needed. The gain of the projection contact has no unit.
@@ -25,7 +25,7 @@ MethodName = Literal["unrolled", "implicit", "frozen", "event-aware", "smoothed"
 
 
 def _numbers(value: Any) -> Any:
-    """Validate a number or an array of numbers, with one error message (a union type would give two)."""
+    """Validate a number or an array of numbers, with a single error message."""
     for item in value if isinstance(value, list | tuple) else (value,):
         if isinstance(item, bool) or not isinstance(item, int | float):
             raise PydanticKnownError("float_type")
@@ -96,7 +96,7 @@ class SineControl(TomlTable):
 
 
 class ValuesControl(TomlTable):
-    """The acceleration is given for each time step, and is constant during the step."""
+    """The acceleration is given for each time step."""
 
     kind: Literal["values"]
     values: Annotated[tuple[float, ...], from_array] = Field(
@@ -128,7 +128,7 @@ class _Contact(TomlTable):
 
 
 class PenaltyContact(_Contact):
-    """A spring that pushes the ball upward while the ball is below the floor."""
+    """A spring that pushes the ball upward below the floor."""
 
     kind: Literal["penalty"]
     k: Positive = Field(description="stiffness per mass (1/s²)")
@@ -203,7 +203,7 @@ class RelativeRule(_Tolerance):
 
 
 class FixedRule(TomlTable):
-    """The solver makes a fixed number of iterations and does not test the residual."""
+    """The solver makes a fixed number of iterations. It does not test the residual."""
 
     rule: Literal["fixed"]
     count: int = Field(ge=1, le=_MOST, description="iterations of every solve")
@@ -226,7 +226,7 @@ class IntegratorTable(TomlTable):
 
 
 class BallPrecision(TomlTable):
-    """Floating-point formats, the order in which residuals are summed, and the rounding of the state."""
+    """Floating-point formats, the order of sums of residuals, and the rounding of the state."""
 
     state: FloatName = Field(default="float64", description="heights and velocities")
     arithmetic: FloatName = Field(default="float64", description="everything a step computes")
@@ -317,7 +317,7 @@ class BallSpec(TomlTable):
 
     @staticmethod
     def follow(data: dict[str, Any], values: Mapping[Key, Any]) -> None:
-        """Remove settings of the file that do not apply to a newly requested contact or integrator."""
+        """Remove settings that do not apply to a newly requested contact or integrator."""
         contact, integrator, gradient = (data.get(key) for key in ("contact", "integrator", "gradient"))
         if not {("contact", "kind"), ("integrator", "kind")} & set(values):
             return
@@ -345,12 +345,12 @@ Problem = tuple[str, str, str]
 
 
 def parameters(contact: str) -> tuple[str, ...]:
-    """Return the names of the parameters for which a kind of contact has gradients."""
+    """Return the parameters for which a kind of contact has gradients."""
     return (*_PARAMETERS.get(contact, ()), "gravity", "h", "y0", "v0")
 
 
 def solves(contact: str | None, integrator: str | None) -> bool:
-    """Return True if a step needs an iterative solver: a projection, or an implicitly integrated spring."""
+    """Return True if a step needs an iterative solver: a projection or an implicit spring."""
     return contact == "projection" or (integrator == "implicit-midpoint" and contact == "penalty")
 
 
@@ -497,7 +497,7 @@ def _stops(spec: BallSpec) -> Iterator[Problem]:
 
 
 def _unrepresentable(spec: BallSpec) -> Iterator[Problem]:
-    """Find numbers outside the range of their format, and tolerances that only a residual of 0 would meet."""
+    """Find numbers outside the range of their format, and tolerances that only a zero residual meets."""
     precision, stop = spec.precision, spec.stop
     # every number with a role: key, value, role, the smallest that the role can use
     held: list[tuple[str, float, str, float | None]] = []
@@ -562,7 +562,7 @@ def _losses(spec: BallSpec) -> Iterator[Problem]:
 
 
 def remarks(spec: BallSpec) -> Iterator[tuple[str, dict[str, Any]]]:
-    """Find valid settings that are probably unintended; yield the code of each finding and its values."""
+    """Find valid settings that are probably unintended. Yield code and values of each finding."""
     stop, contact = spec.stop, spec.contact
     if isinstance(contact, ProjectionContact):
         # a height just below the floor is the difference of two numbers of the size of one step's fall

@@ -1,8 +1,8 @@
-"""Commands of mdnum, called verbs; each verb has a module here, and a function in the package `mdnum`.
+"""Commands of mdnum, called verbs. Each verb is a module here and a function of `mdnum`.
 
-Each verb is declared in its module (see `mdnum.verbs.frame`) and in the text file of the same name;
-`__init__.toml` explains the tables in text files. No other file lists the commands or the kinds of output
-folders. The module of a verb is imported when the verb is first used.
+A verb is declared in its module (see `mdnum.verbs.frame`) and in the text file of the same name.
+`__init__.toml` explains the text files. No other file lists the commands or the kinds of output folders. The
+module of a verb is imported when the verb is first used.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from mdnum.registry import Registry
 
 
 def _check(module: Any) -> None:
-    """Raise an error if a verb of another package lacks functions that its text file declares."""
+    """Raise an error if a verb of another package lacks a declared function."""
     from mdnum.store import Layout
 
     texts, name = beside(module.__file__), module.__name__
@@ -80,7 +80,7 @@ def assigned(text: str, example: str) -> tuple[str, str]:
 
 
 def declared(name: str) -> Mapping[str, Any]:
-    """Return the content of the text file of a verb, given by its name in `VERBS`.
+    """Return the content of the text file of a verb.
 
     Raises:
         InputError: the package that defines the verb has no text file.
@@ -89,7 +89,7 @@ def declared(name: str) -> Mapping[str, Any]:
 
 
 def home(kind: str) -> str:
-    """Return the name of the verb whose text file declares the given kind of output folder.
+    """Return the verb that declares a kind of output folder.
 
     Raises:
         InputError: no installed verb declares the kind.
@@ -108,7 +108,7 @@ def home(kind: str) -> str:
 
 
 def schema(kind: str) -> dict[str, Any]:
-    """Return the JSON Schema of a kind of document, or that of answer.json if the kind has no schema.
+    """Return the JSON Schema of a kind of document. The default is that of answer.json.
 
     Raises:
         InputError: no installed verb makes such documents.
@@ -123,7 +123,7 @@ def schema(kind: str) -> dict[str, Any]:
 
 
 def _file(name: str) -> str:
-    """Return the path of a module's file without importing the module or its packages."""
+    """Return the path of a module's file without importing the module."""
     first, *rest = VERBS.place(name).split(".")
     spec = importlib.util.find_spec(first)
     places = [] if spec is None else spec.submodule_search_locations or [str(Path(str(spec.origin)).parent)]

@@ -1,7 +1,6 @@
-"""Measures of a sweep that require further runs: divergence of two runs, and gradients.
+"""Measures of a sweep that need further runs: divergence of runs, and gradients.
 
-The measures are defined here, not in `mdnum.sweeps.measures`, because the package `sweeps` must not import
-forks and gradients.
+The measures are defined here, because `mdnum.sweeps` must not import forks and gradients.
 """
 
 from __future__ import annotations
@@ -24,7 +23,7 @@ def _twin(simulation: Any, steps: int, argument: str) -> Any:
 
 
 def _pair(run: Sample, argument: str) -> Any:
-    """Run a system twice until the runs diverge; by default, one initial coordinate differs by one ulp."""
+    """Run a system twice until the runs diverge. By default, one initial coordinate differs by one ulp."""
     from mdnum.forks import fork
 
     if ("fork", argument) not in run.made:
@@ -43,17 +42,17 @@ def _date(run: Sample, argument: str, name: str) -> Value:
 
 
 def fork(run: Sample, argument: str) -> Value:
-    """Time at which two runs first make different decisions; the error is the scatter between seeds."""
+    """Time at which two runs first decide differently. Error: scatter between seeds."""
     return _date(run, argument, "fork")
 
 
 def split(run: Sample, argument: str) -> Value:
-    """Time until two runs are 0.01 cutoff radii apart; the error is the scatter between seeds."""
+    """Time until two runs are 0.01 cutoff radii apart. Error: scatter between seeds."""
     return _date(run, argument, "split")
 
 
 def separation(run: Sample, argument: str) -> Value:
-    """Exponential growth rate of the distance between two runs, in 1/time, from a fit of its logarithm."""
+    """Exponential growth rate of the distance between two runs, in 1/time, from a fit."""
     found = _pair(run, argument)
     grown = found.growth["B"]
     if not grown.plain:
@@ -62,7 +61,7 @@ def separation(run: Sample, argument: str) -> Value:
 
 
 def _asked(simulation: Any, steps: int, argument: str) -> tuple[Any, str]:
-    """Return the loss and the full name of the parameter from a text of the form LOSS/PARAMETER."""
+    """Return loss and full parameter name of a text LOSS/PARAMETER."""
     from mdnum.gradients import parameters
     from mdnum.gradients.losses import parse
 
@@ -77,7 +76,7 @@ def _asked(simulation: Any, steps: int, argument: str) -> tuple[Any, str]:
 
 
 def _diagnosis(run: Sample, argument: str) -> tuple[Any, str]:
-    """Return the gradient and its trust horizon, as in `mdnum grad`, and the parameter's full name."""
+    """Return gradient and trust horizon, as in `mdnum grad`, and the full parameter name."""
     from mdnum.gradients import Problem
     from mdnum.gradients.diagnose import diagnose
 
@@ -100,7 +99,7 @@ def gradient(run: Sample, argument: str) -> Value:
 
 
 def horizon(run: Sample, argument: str) -> Value:
-    """Time up to which a derivative of a loss can be trusted; the error is the scatter between seeds."""
+    """Time up to which a derivative of a loss can be trusted. Error: scatter between seeds."""
     found, _ = _diagnosis(run, argument)
     if found.trust is None:
         raise InputError(found.failed["trust"])

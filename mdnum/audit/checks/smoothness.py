@@ -1,4 +1,4 @@
-"""Check the smoothness of the energy at distance thresholds, for pairs, triples and larger environments."""
+"""Check the smoothness of the energy at distance thresholds."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ class SmoothnessCheck(AuditCheck):
     neighbors, routes = 160, 2
 
     def ask(self, subject: CalculatorSubject, progress: Progress) -> CheckResult:
-        """Move pairs and triples of atoms through distance thresholds, and test atoms with many neighbors."""
+        """Move pairs and triples of atoms through thresholds, and test atoms with many neighbors."""
         walks = walk_pairs(subject, progress)
         if not walks.walks and subject.meter.deadline.passed:
             raise TimeUp
@@ -99,7 +99,7 @@ def _two(threshold: PairThreshold) -> str:
 def figures(
     walks: PairWalks, around: EnvironmentWalks, crowds: Sequence[Crowd], kT: float
 ) -> tuple[tuple[list[str], dict[str, Any]], dict[str, Any]]:
-    """Return the text about thresholds, the values that are inserted into it, and numbers for the summary."""
+    """Return the text about thresholds, its values, and numbers for the summary."""
     # (lowest derivative that jumps, jump of the energy, of the force) wherever something does
     seen = [(one.order, *one.jumps[:2]) for one in _all(walks)]
     seen += [(one.jump.order, one.jump.energy, one.force) for one in around.events]
@@ -157,7 +157,7 @@ def _rounded_up(value: float) -> float:
 
 
 def _jumps(walks: PairWalks, around: EnvironmentWalks, kT: float) -> Iterator[Observed]:
-    """Yield findings about distance thresholds, grouped by the lowest derivative of the energy that jumps."""
+    """Yield findings about thresholds, by the lowest derivative of the energy that jumps."""
     for order, code in enumerate(("ENERGY_JUMP", "FORCE_JUMP", "CURVATURE_JUMP")):
         same = [one for one in _all(walks) if one.order == order]
         if not same:
@@ -186,7 +186,7 @@ def _jumps(walks: PairWalks, around: EnvironmentWalks, kT: float) -> Iterator[Ob
 
 
 def _at_cutoff(around: EnvironmentWalks, kT: float) -> Iterator[Observed]:
-    """Yield a finding if the energy of many atoms is less smooth at a threshold than the energy of two."""
+    """Yield a finding if many atoms have a less smooth energy than two."""
     if not around.lower:
         return
     worst = min(
@@ -208,7 +208,7 @@ def _at_cutoff(around: EnvironmentWalks, kT: float) -> Iterator[Observed]:
 
 
 def _logged(subject: CalculatorSubject, walks: PairWalks) -> Iterator[Observed]:
-    """Yield a finding if `energy`, which a run logs, jumps at a threshold and `free_energy` does not."""
+    """Yield a finding if `energy` jumps at a threshold and `free_energy` does not. A run logs `energy`."""
     jumps: list[tuple[float, float, str, str]] = []
     for walk in walks.walks:
         for one in walk.thresholds:
@@ -243,7 +243,7 @@ def _among_many(around: EnvironmentWalks, kT: float, not_walked: Sequence[str]) 
 
 
 def _caps(one: Crowd, kT: float) -> Iterator[Observed]:
-    """Yield findings about atoms with many neighbors, such as a limit on the number of neighbors."""
+    """Yield findings about atoms with many neighbors."""
     values: dict[str, Any] = {"species": one.species, "radius": one.radius}
     if one.kept:
         values |= {"kept": one.kept, "distance": one.distance, "force": one.force}
@@ -265,7 +265,7 @@ def _caps(one: Crowd, kT: float) -> Iterator[Observed]:
 
 
 def reach(walk: PairWalk, kT: float) -> Iterator[Observed]:
-    """Yield findings on a pair interaction: no cutoff, a steep switching function, unexamined distances."""
+    """Yield findings on a pair: no cutoff, a steep switching function, unexamined distances."""
     further = walk.further
     if walk.cutoff is None and np.abs(walk.energy).max() > 0:
         # what was searched for an end, and no more
@@ -285,7 +285,7 @@ def reach(walk: PairWalk, kT: float) -> Iterator[Observed]:
 
 
 def _steepness(walk: PairWalk) -> tuple[float, float] | None:
-    """Return (largest curvature / curvature at the energy minimum, distance of the largest curvature)."""
+    """Return (largest curvature / curvature at the minimum, distance of the largest curvature)."""
     curvature = -np.gradient(walk.force, walk.distance)
     bottom = int(np.argmin(walk.energy))
     if walk.energy[bottom] >= 0 or bottom < 2 or curvature[bottom] <= 0:
@@ -302,7 +302,7 @@ def _steepness(walk: PairWalk) -> tuple[float, float] | None:
 
 
 def _first_to_jump(event: Event) -> str:
-    """Return the name of the lowest derivative of the energy that jumps at a point of the atoms' path."""
+    """Return the name of the lowest derivative of the energy that jumps."""
     order = event.jump.order
     return ORDERS[max(order, event.threshold.order) if order == SMOOTH and event.threshold else order]
 
@@ -371,7 +371,7 @@ def _charts(walks: PairWalks, subject: CalculatorSubject) -> list[Chart]:
 
 
 def _energies(walk: PairWalk, kT: float) -> Chart:
-    """Chart of the pair energy; the energy range is chosen to make the jumps at thresholds visible."""
+    """Chart of the pair energy. The energy range shows the jumps at thresholds."""
     depth = max(-float(walk.energy.min()), 2 * kT)
     shown = walk.energy < 2 * depth
     first = len(shown) - int(np.argmin(shown[::-1])) if not shown.all() else 0
@@ -385,7 +385,7 @@ def _energies(walk: PairWalk, kT: float) -> Chart:
 
 
 def _close_up(walk: PairWalk, threshold: PairThreshold, subject: CalculatorSubject) -> Chart:
-    """Chart of the energy or force near a jump, at adjacent floating-point distances on both sides."""
+    """Chart of the energy or force near a jump, at adjacent floating-point distances."""
     below, above = [threshold.inside], [threshold.outside]
     for _ in range(_ULPS - 1):
         below.append(float(np.nextafter(below[-1], -np.inf)))

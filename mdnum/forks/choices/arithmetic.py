@@ -288,7 +288,7 @@ class Builder(Summed):
 
 @choice("skin")
 class Skin(Summed):
-    """Another skin width. It changes the pairs in neighbor lists and the steps of rebuilds."""
+    """Another skin width of the neighbor lists."""
 
     screened = "skin skin@exact"
     # of the skin; None for half as much again, or three quarters where the box has no room

@@ -1,4 +1,4 @@
-"""The base class of numerical choices, and the two programs that differ in a choice."""
+"""The base class of numerical choices, and pairs of programs that differ in one."""
 
 from __future__ import annotations
 
@@ -29,13 +29,13 @@ _SIGNED = ("ulps", "more")
 
 
 class Choice:
-    """One numerical choice, such as the precision; its arguments are the fields of a frozen dataclass.
+    """One numerical choice, such as the precision. Its arguments are the fields of a frozen dataclass.
 
-    To add a choice, decorate a subclass with `choice("family")`, where the family is the word before "=" in
-    the text of the choice. A choice in another package sets its own `family`, is decorated with
-    `choice(None)` and is registered as an entry point of the group "mdnum.choices". The fields of a choice
-    are written after "=", separated by ":"; the field `both`, if it exists, is written after "@". The first
-    line of the class docstring describes the choice for users.
+    To add a choice, decorate a subclass with `choice("family")`. The family is the word before "=" in the
+    choice's text. A choice in another package sets its own `family` and is decorated with `choice(None)`. It
+    is an entry point of the group "mdnum.choices". The fields of a choice are written after "=", separated by
+    ":". A field `both` is written after "@". The first line of the class docstring describes the choice for
+    users.
     """
 
     family: ClassVar[str] = ""  # the word before "="
@@ -72,7 +72,7 @@ class Choice:
 
     @classmethod
     def parse(cls, argument: str, role: str, both: str | None) -> Choice:
-        """Create a choice from the parts of the text "family.role=argument@both"; missing parts are empty.
+        """Create a choice from the parts of the text "family.role=argument@both". Missing parts are empty.
 
         Raises:
             InputError: the argument is not valid for this choice.
@@ -87,7 +87,7 @@ class Choice:
         return cls(**values)
 
     def make(self, system: Any) -> Twin:
-        """Make two programs that differ in this choice, for a `Simulation` or a `BallSystem`.
+        """Make two programs that differ in this choice.
 
         Raises:
             InputError: the choice does not apply to the system; the message gives the reason.
@@ -104,7 +104,7 @@ CHOICES: Registry[Any] = Registry("choice", "mdnum.choices", Choice)
 
 @dataclass_transform(frozen_default=True)
 def choice(family: str | None):
-    """Make a subclass of `Choice` a frozen dataclass, and register the subclass if a family is given."""
+    """Make a subclass of `Choice` a frozen dataclass. Register it if a family is given."""
 
     def add(cls: type[Any]) -> type[Any]:
         made = dataclass(frozen=True)(cls)
@@ -117,7 +117,7 @@ def choice(family: str | None):
 
 
 def shipped(world: str) -> dict[str, Choice]:
-    """Return, by name, the choices tested by default in molecular dynamics ("md") or for a "ball"."""
+    """Return the default choices of molecular dynamics ("md") or of a "ball", by name."""
 
     def of_family(kind: type[Choice]) -> Iterable[Choice]:
         words = kind.screened if isinstance(kind.screened, str) else kind.screened[world]
@@ -128,13 +128,13 @@ def shipped(world: str) -> dict[str, Choice]:
 
 
 def unavailable(choice: Choice, system: Simulation | System | BallSystem) -> str | None:
-    """Return the reason why a choice does not apply to a system; None if the choice applies."""
+    """Return why a choice does not apply to a system. None if it applies."""
     made = twin_or_reason(choice, system)
     return made if isinstance(made, str) else None
 
 
 def twin_or_reason(choice: Choice, system: Simulation | System | BallSystem) -> Twin | str:
-    """Make two programs that differ in a choice, or return the reason why this is not possible."""
+    """Make two programs that differ in a choice, or return why this is not possible."""
     if world_of(system) not in choice.worlds:
         return f"it is a choice {_WORLDS[choice.worlds[0]]}"
     try:
@@ -210,19 +210,19 @@ def parse(text: str, world: str | None = None) -> Choice:
 
 
 def check(is_good: bool, message: str, where: str, remedy: str | None = None) -> None:
-    """Raise an `InputError` with the given message if an argument of a choice is not valid."""
+    """Raise an `InputError` if an argument of a choice is not valid."""
     if not is_good:
         raise InputError(message, where=where, remedy=remedy)
 
 
 def applies(is_so: bool, reason: str) -> None:
-    """Raise an `InputError` with the given reason unless a choice applies to a system."""
+    """Raise an `InputError` unless a choice applies to a system."""
     if not is_so:
         raise InputError(reason)
 
 
 def number(text: str, kind: type, where: str) -> Any:
-    """Parse a number in the argument of a choice; raise an `InputError` if the text is not a number."""
+    """Parse a number in the argument of a choice. Raise an `InputError` for other text."""
     try:
         return kind(text)
     except ValueError:
@@ -236,7 +236,7 @@ def some(count: int, where: str) -> None:
 
 
 def plural(count: int, noun: str) -> str:
-    """Return a noun in the singular or plural form (with a final s), according to a count."""
+    """Return a noun in the singular or plural form (final s), for a count."""
     return noun if abs(count) == 1 else f"{noun}s"
 
 
@@ -246,9 +246,9 @@ def summing(both: str | None) -> str:
 
 
 def summed(simulation: Simulation, both: str | None = None) -> Simulation:
-    """Return a simulation that sums forces by another method, such as "exact" or "permuted:3".
+    """Return a simulation with another sum of forces, such as "exact" or "permuted:3".
 
-    An `InputError` is raised for a many-body potential, whose order of sums is fixed.
+    A many-body potential raises an `InputError`, since its order of sums is fixed.
     """
     if both is None:
         return simulation
@@ -269,7 +269,7 @@ def simulations(a: Any, b: Any, difference: str, frame: Any = None) -> Twin:
 
 @choice(None)
 class Summed(Choice):
-    """A choice that can set how both runs compute sums; the runs must agree if the order has no effect."""
+    """A choice that can set how both runs compute sums."""
 
     worlds = ("md",)
     both: str | None = None  # reduction of both runs; None for the system's own
@@ -280,7 +280,7 @@ class Summed(Choice):
 
     @property
     def must_hold(self) -> bool:  # type: ignore[override]
-        """True if the sums of both runs do not depend on order, so that the choice cannot have an effect."""
+        """True if the sums of both runs do not depend on order. The choice then has no effect."""
         return self.both in ORDERLESS
 
     def twin(self, a: Any, b: Any, difference: str, frame: Any = None) -> Twin:

@@ -142,7 +142,7 @@ def _read(word: str) -> tuple[list[int], list[float]]:
 
 @choice("translate")
 class Translate(Summed):
-    """All atoms moved by a fraction of the lattice vectors. This changes the rounding of coordinates."""
+    """All atoms moved by a fraction of the lattice vectors."""
 
     screened = "translate=0.25 translate=lattice"
     must_hold = False  # type: ignore[assignment]

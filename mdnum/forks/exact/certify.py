@@ -1,4 +1,4 @@
-"""Find the step at which runs in each precision leave the exact history (decisions in exact arithmetic)."""
+"""Find when runs in each precision leave the exact history (decisions in exact arithmetic)."""
 
 from __future__ import annotations
 
@@ -49,7 +49,7 @@ _EXPONENTIAL = 0.95
 
 @dataclass(frozen=True)
 class PolicyHorizon:
-    """Number of steps during which a run in one precision follows the exact history."""
+    """Number of steps for which one precision follows the exact history."""
 
     # name, roles: of the precision, and its dtype by role
     name: str
@@ -71,22 +71,22 @@ class PolicyHorizon:
 
     @property
     def horizon(self) -> int | None:
-        """First step with a decision that differs from the exact decision; None if all decisions agree."""
+        """First step with a decision that differs from the exact one. None if all agree."""
         return None if self.decision is None else self.decision.step
 
     @property
     def margin(self) -> float:
-        """Margin, in the exact run, of the first wrong decision of a run; NaN if no decision is wrong."""
+        """Margin of the first wrong decision, in the exact run. NaN if none is wrong."""
         return float("nan") if self.decision is None else self.decision.margins["A"]
 
     def is_all(self, dtype: str) -> bool:
-        """Return True if all roles, such as state and force, have the given dtype."""
+        """Return True if all roles have the given dtype."""
         return set(self.roles.values()) == {dtype}
 
 
 @result
 class Certificate:
-    """The exact history of a system, and the number of steps during which finite-precision runs follow it."""
+    """The exact history of a system, and how long finite-precision runs follow it."""
 
     steps: int  # last step
     timestep: float  # in the user's units of time
@@ -103,10 +103,10 @@ def certify(
     policies: Mapping[str, Roles] | None = None,
     progress: Progress | None = None,
 ) -> Certificate:
-    """Compute the exact history of a system, and the step at which runs in each precision leave this history.
+    """Compute the exact history, and the step at which each precision leaves it.
 
     The numbers of the system file are rounded to float64. A run in lower precision rounds the numbers of the
-    system file further; its deviation from the exact history includes this rounding.
+    file again. Its deviation includes this rounding.
 
     Args:
         system: a Lennard-Jones system of at most 108 atoms at constant energy (NVE), or a ball whose time
@@ -163,7 +163,7 @@ def _certify_md(system: Simulation, last: int, policies: Mapping[str, Roles], no
     matrix = np.where(np.array(simulation.pbc)[:, None], np.asarray(simulation.cell.matrix), 0.0)
 
     def reduced(x: Float[np.ndarray, "... 3"]) -> Float[np.ndarray, "... 3"]:
-        """Wrap positions into the box, so that nearest images are at most one lattice vector away."""
+        """Wrap positions into the box. Nearest images are then at most one lattice vector away."""
         return x - np.floor(x @ np.asarray(simulation.cell.inverse)) @ matrix
 
     rows = []
@@ -227,7 +227,7 @@ def _certify_ball(system: BallSystem, last: int, policies: Mapping[str, Roles], 
 
 
 def _steps_per_bit(rows: list[PolicyHorizon]) -> float:
-    """Return the number of steps in which the deviation doubles, from the fit that covers the most steps."""
+    """Return the number of steps in which the deviation doubles, from the longest fit."""
     # separations that grow by a power of time, as those of a lone pair, are no exponentials
     fits = [row.growth for row in rows if row.growth is not None]
     fits = [fit for fit in fits if fit.rate > 0 and fit.r_squared > _EXPONENTIAL]
@@ -237,7 +237,7 @@ def _steps_per_bit(rows: list[PolicyHorizon]) -> float:
 
 
 def _with_gains(rows: list[PolicyHorizon], last: int) -> list[PolicyHorizon]:
-    """Add each policy's gain in steps over single precision, divided by the gain of double precision."""
+    """Add the gain of each precision policy. Single precision has gain 0, double precision 1."""
     low = next((row for row in rows if row.is_all("float32")), None)
     high = next((row for row in rows if row.is_all("float64")), None)
     if low is None or low.horizon is None:
@@ -254,10 +254,10 @@ def _with_gains(rows: list[PolicyHorizon], last: int) -> list[PolicyHorizon]:
 
 
 def _closer(base: PolicyHorizon, row: PolicyHorizon) -> float:
-    """Return how many more bits of the exact positions one run reproduces than another run.
+    """Return how many more bits of the exact positions one run has than another.
 
-    The number of bits is the median over the second half of the steps before the first wrong decision. The
-    median, unlike the step of a wrong decision, does not depend on which pair approaches its cutoff.
+    The number is the median over the second half of the steps before the first wrong decision. This median
+    does not depend on which pair approaches its cutoff.
     """
     if base.separation is None or row.separation is None:
         return float("nan")
