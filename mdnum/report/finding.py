@@ -252,7 +252,7 @@ def conclude(
             headline = f"{worst.title[:1].upper()}{worst.title[1:]}. {headline}"
         elif worst.severity == "warning":
             more = sum(finding.severity == "warning" for finding in findings) - 1
-            rest = f", and {words.many(more, 'more point')} below" if more else ""
+            rest = f", and {words.many(more, 'more warning')}" if more else ""
             headline = f"{headline} Look first: {worst.title}{rest}."
     return Verdict(tone, headline, tuple(evidence), findings)
 

@@ -342,7 +342,9 @@ def _rule_sections(view: FlipsView, place: int, one: Rule) -> Iterator[Section]:
 
     yield section("Pairs and flips", pairs(_numbers(view, one)), level=2)
     if view.by_residue and (lasting := _lasting(view, place)) is not None:
-        yield section("Contacts between residues", lasting, terminal=True)
+        total = int((view.table("occupancy")["rule"] == place).sum())
+        text = TEXTS("lasting", pairs=total, rule=view.rule(one))
+        yield section("Contacts between residues", text, lasting, terminal=True)
     yield section("How long contacts last", pairs(_lifetimes(view, one)))
     lost = list(_lost(view, one))
     yield section("Between the frames", *([pairs(lost)] if lost else []))
@@ -498,7 +500,7 @@ def _plots(view: FlipsView, place: int, one: Rule) -> Iterator[tuple[str, Plot]]
 
 
 def _lasting(view: FlipsView, place: int) -> Table | None:
-    """Return the residue pairs with the longest contact time. None without contacts."""
+    """Return the residue pairs whose contacts change most often. None without contacts."""
     table, frames = view.table("occupancy"), view.summary["frames"]
     rows = np.flatnonzero(table["rule"] == place)
     # those throughout are most often neighbors along a chain

@@ -112,9 +112,10 @@ class Outcome:
         return {**vars(self), "path": self._place, "result": None, "_page": None}
 
     def __repr__(self) -> str:
-        numbers = [f"{key.label} {key.value}" for key in self.keys if key.value != "–"][:6]
+        shown = [key for key in self.keys if key.value != "–"][:6]
+        numbers = [f"{key.label}: {key.value}" + f" ({key.note})" * bool(key.note) for key in shown]
         head = f"mdnum {self.verb}: {self.title}", f"{self.verdict.tone}: {self.verdict.headline}"
-        lines = (" ".join(printable(line).split()) for line in (*head, "; ".join(numbers)) if line)
+        lines = (" ".join(printable(line).split()) for line in (*head, *numbers))
         short = (line if len(line) <= 300 else f"{line[:300]}…" for line in lines)
         where = f"{'answered before, read from ' * self.reused}{self.path}"
         return "\n  ".join([*short, printable(where)])

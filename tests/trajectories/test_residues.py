@@ -131,6 +131,7 @@ def test_hydrogens_and_virtual_sites_are_left_out_unless_they_are_wanted(
     ]
     (printed,) = (one for one in found.page.sections if one.title == "Contacts between residues")
     assert printed.terminal
+    assert "contacts.parquet" in printed.parts[0] and "occupancy.parquet" in printed.parts[0]
     assert found.summary["left_out"] == ({} if hydrogens else {"hydrogens": 2, "virtual sites": 2})
     assert ("2 hydrogens" in " ".join(found.verdict.evidence)) is not hydrogens
     flips = found.table("flips").to_pandas()

@@ -158,8 +158,10 @@ def test_every_figure_of_its_page_can_be_drawn(outcome):
 
 def test_what_is_shown_of_it_fits_a_screen(outcome):
     text = repr(outcome)
-    assert 2 <= text.count("\n") <= 3 and len(text) < 1_300 and str(outcome.path) in text
+    assert 2 <= text.count("\n") <= 8 and len(text) < 2_000 and str(outcome.path) in text
     assert f"mdnum {outcome.verb}: " in text and outcome.verdict.headline[:25] in text
+    # a number stands with its unit
+    assert all(" ".join(key.note.split()) in text for key in outcome.keys[:6] if key.value != "–")
     html = outcome._repr_html_()
     shown = (outcome.verdict.headline, *(one.text for one in outcome.findings if not one.cause))
     assert all(str(escape(one)).replace("&#x27;", "&#39;") in html for one in shown)
