@@ -1,4 +1,4 @@
-"""Detect errors at certain places in the list of atoms, such as the last one."""
+"""Detect errors at certain places in the list of atoms, such as the last atom."""
 
 from __future__ import annotations
 

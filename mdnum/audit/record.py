@@ -179,7 +179,7 @@ def encoded(atoms: Atoms) -> str:
 
 
 def script(words: str, pairs: Sequence[str], units: Units = METAL) -> str:
-    """Return a script that shows the error with ASE alone: equivalent structures, different energy or forces.
+    """Return a script that shows an error of a calculator with ASE alone.
 
     Args:
         words: the calculator as the user named it.

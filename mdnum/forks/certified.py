@@ -94,9 +94,9 @@ def _horizon(run: Simulation, ambiguous: Float[np.ndarray, "steps"]) -> Horizon:
 def protection(fork: Fork) -> tuple[Float[np.ndarray, "steps"], Float[np.ndarray, "steps"]]:
     """Return the smallest |pair distance - cutoff| of each step, and the bound above which decisions agree.
 
-    If atoms differ by at most d between the runs, a pair distance differs by at most 2 d.
-    Pair distances are taken from the run with the smaller rounding error. The rounding error of the distances
-    is added to the bound.
+    If positions differ by at most d between the runs, a pair distance differs by at most 2 d. Pair distances
+    are taken from the run with the smaller rounding error. The rounding error of the distances is added to
+    the bound.
     """
     deciders = {"A": fork.twin.a.simulation.decider, "B": fork.twin.b.simulation.decider}
     a, b = deciders.values()

@@ -112,7 +112,7 @@ def fork(
     repeats: int | None = None,
     progress: Progress | None = None,
 ) -> Fork:
-    """Compare two runs step by step until they split, and measure how much the flips contribute to the split.
+    """Compare two runs step by step until they split. Measure how much flips contribute to the split.
 
     Args:
         twin: the pair of programs.

@@ -301,10 +301,10 @@ def _of_energy(force, x, tables, bits, onto_force, onto_energy, onto_virial, wan
 class AdjointCarry(NamedTuple):
     """Cotangents that a reverse pass propagates from each step to the preceding step.
 
-    A trace is an `AdjointCarry` with the cotangents at every step except the first frame.
-    Row k contains the cotangents of positions and half-kicked velocities at the beginning of step first + k.
-    Row k excludes cutoff crossings that lead to the state at step first + k. Atoms in a trace are in the
-    order of the neighbor list. Unused rows at the end of a trace are undefined.
+    A trace is an `AdjointCarry` with the cotangents at every step, but without those of the first frame. Row
+    k contains the cotangents of positions and half-kicked velocities at the beginning of step first + k. Row
+    k excludes cutoff crossings that lead to the state at step first + k. Atoms in a trace are in the order of
+    the neighbor list. Unused rows at the end of a trace are undefined.
     """
 
     x: Float[Array, "3 atoms"]  # cotangent of the positions at the step that comes next in time

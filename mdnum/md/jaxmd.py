@@ -230,8 +230,8 @@ def multi_image(
 class PairSearch:
     """Neighbor search of jax-md for one cell, for repeated calls with new positions.
 
-    Positions are passed to jax-md as fractional coordinates in [0, 1). The box is the distances between
-    opposite faces. For positions outside the box, jax-md loses pairs without an error. The search also
+    Positions are passed to jax-md as fractional coordinates in [0, 1). The distances between opposite faces
+    serve as the box. For positions outside the box, jax-md loses pairs without an error. The search also
     rejects some valid triclinic boxes. After every search, the overflow flag is read outside jit. After an
     overflow, the neighbor list is enlarged.
 

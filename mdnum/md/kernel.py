@@ -220,7 +220,7 @@ def _number(value: Any, kind: str = "VEC") -> str:
 
 
 def _whole_power(equation: Any, inputs: list[Any]) -> int:
-    """Return the exponent if products compute a power, and 0 otherwise."""
+    """Return the exponent of a power that is computed by products, and 0 otherwise."""
     name, y = equation.primitive.name, inputs[-1]
     if name in ("square", "integer_pow"):
         return equation.params.get("y", 2)

@@ -13,7 +13,7 @@ from jaxtyping import Bool, Float, Int
 class Columns:
     """Base class of tables, which are dataclasses with columns of equal length. The first field is an array.
 
-    A field without an array is one text for all rows, or None if unknown.
+    A field that is not an array is one text for all rows, or None if unknown.
     """
 
     def __len__(self) -> int:

@@ -1,6 +1,6 @@
 """Summation orders and their error bounds.
 
-A summation order is used in two ways. The force loop passes blocks of terms, and carries a partial sum from
+A summation order is used in two ways. The force loop adds blocks of terms, and carries a partial sum from
 block to block. The terms of a whole neighbor list are therefore never stored at once. If an order needs all
 terms, they are stored and added at the end. Code outside of the force loop passes a whole array, and gets the
 sum over its first axis. The sum is rounded after every addition. A numpy loop in the dtype of the terms gives

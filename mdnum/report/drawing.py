@@ -296,12 +296,12 @@ def _edges(centers: np.ndarray, log: bool) -> np.ndarray:
 
 
 def _named(names: tuple[str, ...], value: float, _: int | None = None) -> str:
-    """Return the label of a power of ten on a logarithmic axis, or an empty string."""
+    """Return the label of an integer position on an axis, or an empty string."""
     return names[round(value)] if value == round(value) and 0 <= value < len(names) else ""
 
 
 def _decade(value: float, _: int | None = None) -> str:
-    """Return the label of a power of ten on a logarithmic axis; an empty string between two powers."""
+    """Return the label of a power of ten on a logarithmic axis, or an empty string."""
     exponent = np.log10(abs(value)) if value else 0.0
     if not np.isclose(exponent, round(exponent), atol=1e-6):
         return ""

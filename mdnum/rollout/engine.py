@@ -85,7 +85,7 @@ class Segment:
         return self.first + self.rows - 1
 
     def rows_of(self, name: str) -> np.ndarray:
-        """Return a recorded quantity at all steps. Unrecorded steps are recomputed."""
+        """Return a quantity at all steps, recomputed if it was not recorded."""
         lacks = self.changes is not None and name in ("x", "v", "images", "bits")
         return np.asarray(getattr(self.again() if lacks else self.record, name))[: self.rows]
 

@@ -32,7 +32,7 @@ class EndComparison:
 
     @property
     def worst(self) -> str | None:
-        """A measure outside its tolerance, or else the undecided one that needs the most seeds."""
+        """A measure outside its tolerance, or else the undecided measure that needs the most seeds."""
         each = self.by_measure
         ranked = sorted(each, key=lambda name: (each[name].inside is not False, -each[name].more))
         return next((name for name in ranked if each[name].inside is not True), None)

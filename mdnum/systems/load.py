@@ -1,4 +1,4 @@
-"""Find and load system files, shipped or of the user."""
+"""Find and load system files: shipped systems by name, other files by path."""
 
 from __future__ import annotations
 

@@ -185,7 +185,7 @@ class Simulation:
 
     @cached_property
     def propagator(self) -> Integrator:
-        """The integrator of the simulation. A fixed-point state has a fixed-point version.
+        """The integrator of the simulation. A fixed-point state uses a fixed-point integrator.
 
         Raises:
             InputError: the integrator or its friction does not support a fixed-point state.

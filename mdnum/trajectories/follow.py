@@ -517,7 +517,7 @@ def _sets_at(
     now: Separation,
     before: Separation,
 ) -> None:
-    """Record the difference of two neighbor sets at a frame, and write new pairs of only one set."""
+    """Record the difference of two neighbor sets at a frame. Write pairs that are new in this difference."""
     difference, first = one.difference, False
     if one.certain is None and len(difference):
         # all that differ: one that came to differ within the resolution may be beyond it by now

@@ -217,8 +217,8 @@ def keywords_checked(verb: V, more: Iterable[str] = (), name: str = "") -> V:
 def content(verb: str, asked: Mapping[str, Any]) -> str:
     """Return a digest of the arguments of a verb: 16 hexadecimal digits, the same in every process.
 
-    The digest covers the content of a system, the bytes of a file, the manifest of a run folder, and the
-    values of other arguments. The version of mdnum is also included.
+    The digest covers the content of systems and files, the manifest of a run folder, and all other arguments.
+    The version of mdnum is also included.
 
     Raises:
         InputError: an argument has no plain value, such as a function.

@@ -68,7 +68,7 @@ def run(
     progress: Wanted = None,
     allow_code: bool = False,
 ) -> Outcome:
-    """Simulate a system, record all flips, compare the first and last frame with ASE, and write a report.
+    """Simulate a system, record all flips and write a report. Compare the first and last frame with ASE.
 
     Example:
         >>> mdnum.run("argon/liquid-864", steps=500).folder

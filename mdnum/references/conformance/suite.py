@@ -146,7 +146,7 @@ class Examiner:
         return reasons[0] if reasons and len(reasons) == len(self.opening) else None
 
     def failures(self, case: Case) -> tuple[Failure, ...]:
-        """Return the errors at the first wrong call of a test case. None if a limit excludes the case."""
+        """Return the errors at the first wrong call. No errors if a limit excludes the test case."""
         return () if self.tested.limits.refusal(case) is not None else self.ask(case).failures
 
     def ask(self, case: Case) -> CaseResult:
