@@ -129,7 +129,7 @@ def _objects(subject: Simulation | System) -> Simulation:
 _ASE_PAIR: dict[tuple[type, str], tuple[str, str, Callable[[PairForm], Calculator]]] = {
     (LennardJones, "hard"): (
         "ASE LennardJones",
-        "energy + u(r_cut) for each pair inside; forces as they are",
+        "u(r_cut) added to the energy for each pair inside the cutoff; forces unchanged",
         lambda form: StepAtCutoff(lennard_jones(form), form, form.at_cutoff[0]),
     ),
     (LennardJones, "shifted"): ("ASE LennardJones", "none", lennard_jones),
@@ -140,12 +140,13 @@ _ASE_PAIR: dict[tuple[type, str], tuple[str, str, Callable[[PairForm], Calculato
     ),
     (Morse, "hard"): (
         "ASE MorsePotential",
-        "its own switch moved beyond the pairs listed",
+        "ASE's own switch moved beyond all listed pairs",
         lambda form: morse(form, 2.0 * form.r_cut, 3.0 * form.r_cut),
     ),
     (Morse, "shifted"): (
         "ASE MorsePotential",
-        "its own switch moved away; energy - u(r_cut) for each pair inside",
+        "ASE's own switch moved beyond all listed pairs; "
+        "u(r_cut) subtracted from the energy for each pair inside the cutoff",
         lambda form: StepAtCutoff(morse(form, 2.0 * form.r_cut, 3.0 * form.r_cut), form, -form.at_cutoff[0]),
     ),
     (Morse, "quintic"): (

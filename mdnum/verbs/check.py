@@ -147,6 +147,8 @@ def would_show(report: Any, units: Units) -> Iterator[str]:
     from mdnum.references.energy_check import FORCE, ROUNDINGS
 
     if frames := getattr(report, "frames", ()):
+        if not report.conversion.startswith("none"):
+            yield TEXTS("converted", **vars(report))
         worst = max(frames, key=lambda frame: frame.force_max)
         narrow = report.precision != "float64"
         floor = ROUNDINGS * worst.force_expected if narrow else FORCE * worst.force_scale

@@ -80,8 +80,8 @@ def _headline(view: FlipsView) -> str:
 def _evidence(view: FlipsView) -> Iterator[str]:
     yield resolution(view.summary["resolution"], view.unit)
     if view.by_residue:
-        without = [many(count, what.removesuffix("s")) for what, count in view.summary["left_out"].items()]
-        yield TEXTS("by_residue", without=listed(without) if without else "nothing")
+        kind = "heavy atoms" if "hydrogens" in view.summary["left_out"] else "atoms"
+        yield TEXTS("by_residue", kind=kind, without=_left_out(view.summary) or "none")
     if (lists := view.summary.get("lists")) and not lists["lost"]:
         yield TEXTS("none_lost", **lists)
     for place, one in enumerate(view.summary["rules"][:_TOLD]):
@@ -91,6 +91,12 @@ def _evidence(view: FlipsView) -> Iterator[str]:
         if life["followed"] and life["leaves"]:
             values = {"median": view.life(one), "mean": view.life(one, "mean_by_rate")}
             yield TEXTS("life", rule=view.rule(one), **values)
+
+
+def _left_out(summary: Mapping[str, Any]) -> str:
+    """Return the numbers of atoms that are excluded from contacts of residues, or an empty text."""
+    kinds = summary.get("left_out", {}).items()
+    return listed([many(count, kind.removesuffix("s")) for kind, count in kinds]) if kinds else ""
 
 
 def _ended(view: FlipsView) -> Iterator[Finding]:
@@ -273,6 +279,7 @@ def page(view: FlipsView, verdict: Verdict) -> Page:
     size = many(summary["atoms"], "atom")
     if summary["status"] == "unfinished":
         return view.page(f"{view.name}: neighbor-set flips", size, [], [])
+    size += f" ({excluded} excluded)" if (excluded := _left_out(summary)) else ""
     size += f", {many(summary['frames'], 'frame')}"
     if view.timed:
         size += f" {view.time(plain(summary['interval']))} apart"

@@ -213,6 +213,12 @@ def test_an_agreement_says_from_where_on_there_would_be_none():
     assert checked.report.ok and number(1e-10 * worst.force_scale, 1) in checked.verdict.text
 
 
+@pytest.mark.parametrize(("kind", "converted"), [("hard", True), ("shifted", False)])
+def test_a_conversion_of_the_results_of_ase_is_stated(kind, converted):
+    checked = mdnum.check("energy", make(crystal(), LENNARD_JONES, SHORT | {"kind": kind}))
+    assert checked.report.ok and (checked.report.conversion in checked.verdict.text) is converted
+
+
 def test_float32_trajectories_are_measured_as_such():
     report = check_dynamics(make(crystal(), LENNARD_JONES, SHORT, precision=SINGLE), steps=STEPS)
     assert report.ok and report.precision == "float32"

@@ -134,6 +134,7 @@ def test_hydrogens_and_virtual_sites_are_left_out_unless_they_are_wanted(
     assert "contacts.parquet" in printed.parts[0] and "occupancy.parquet" in printed.parts[0]
     assert found.summary["left_out"] == ({} if hydrogens else {"hydrogens": 2, "virtual sites": 2})
     assert ("2 hydrogens" in " ".join(found.verdict.evidence)) is not hydrogens
+    assert ("2 hydrogens" in found.page.about) is not hydrogens
     flips = found.table("flips").to_pandas()
     assert flips[["residue_name_i", "residue_number_j"]].drop_duplicates().to_numpy().tolist() == [["ALA", 9]]
     total = found.table("occupancy").to_pandas()
