@@ -293,12 +293,14 @@ def _derivatives(trial: Trial, rng: np.random.Generator) -> None:
 def _at_the_cutoff(trial: Trial) -> None:
     """Find the range of the forces. Find the jumps of energy and force at the cutoff."""
     n, r_cut, size = trial.n, trial.model.r_cut, trial.scale
-    r = np.where(trial.idx < n, trial.distances(trial.idx, trial.x), np.inf)
+    # each pair once; in a crystal many are equally close to the cutoff
+    once = (np.arange(n)[:, None] < trial.idx) & (trial.idx < n)
+    r = np.where(once, trial.distances(trial.idx, trial.x), np.inf)
     found, acts = [], []
-    for place in np.argsort(np.abs(r - r_cut), axis=None)[: 2 * _CROSSINGS].tolist():
+    for place in np.argsort(np.abs(r - r_cut), axis=None, kind="stable")[:_CROSSINGS].tolist():
         i, slot = divmod(place, r.shape[1])
         j = int(trial.idx[i, slot])
-        if not i < j < n or abs(r[i, slot] - r_cut) > 0.2 * r_cut or len(found) == _CROSSINGS:
+        if abs(r[i, slot] - r_cut) > 0.2 * r_cut:
             continue
         toward = np.concatenate(displacement(trial.box, trial.x[[i]], trial.x[[j]])) / r[i, slot]
 

@@ -12,7 +12,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from ase import Atoms
+from ase import Atoms, units
 from ase.build import bulk
 from ase.geometry import get_distances
 
@@ -491,6 +491,14 @@ def test_a_part_of_a_large_structure_is_enough_where_it_is_like_the_whole(functi
     assert set(sizes) == {500, len(LARGE)}
 
 
+@pytest.mark.jax_md
+def test_the_cutoff_of_a_perfect_crystal_is_examined():
+    """Many pairs are equally close to the cutoff, and a neighbor list has each of them twice."""
+    function = mdnum.energy_function(classical(atoms := bulk("Ar", "fcc", a=3.352, cubic=True) * 3), RADIUS)
+    made = mdnum.simulation(atoms, function, timestep=0.002, skin=0.52)
+    assert made.model.smoothness == mdnum.md.manybody.Smoothness(1, 0.0, 0.0)
+
+
 @pytest.mark.nightly
 @pytest.mark.jax_md
 def test_units_are_those_that_the_function_is_written_in():
@@ -502,7 +510,7 @@ def test_units_are_those_that_the_function_is_written_in():
     def energy(R, neighbor, **kw):
         # nanometers and kJ/mol
         each = lambda d, real, depth: energies(10 * d, real, depth)  # noqa: E731
-        return jnp.sum(over(space, R, neighbor, DEPTH * 96.48533212331002, each, **kw))
+        return jnp.sum(over(space, R, neighbor, DEPTH / (units.kJ / units.mol), each, **kw))
 
     function = mdnum.energy_function(energy, RADIUS / 10, units=("nm", "kJ/mol"), format="dense")
     one = mdnum.simulation(atoms, function, timestep=0.002, skin=0.2)
