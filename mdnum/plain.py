@@ -1,4 +1,4 @@
-"""Conversion of results to plain values for JSON, TOML and terminals, and access to packaged files."""
+"""Conversion of results to plain values for JSON, TOML and terminals."""
 
 from __future__ import annotations
 
@@ -15,19 +15,19 @@ T = TypeVar("T")
 
 @functools.cache
 def beside(module: str) -> dict[str, Any]:
-    """Return the tables of the TOML file next to a module (`__file__`); callers must not change them."""
+    """Return the tables of the TOML file next to a module (`__file__`). Do not change them."""
     return tomllib.loads(Path(module).with_suffix(".toml").read_text(encoding="utf-8"))
 
 
 def shipped_folder(kind: Literal["systems", "demos"] = "systems") -> Path:
-    """Return the folder of shipped files, which is in the repository for editable installs."""
+    """Return the folder of shipped files. Editable installs use the repository."""
     package = Path(__file__).parent
     packaged = package / f"_{kind}"
     return packaged if packaged.is_dir() else package.parent / kind
 
 
 def shipped_systems() -> list[str]:
-    """Return the names of the shipped systems, such as "argon/liquid-864", without opening a file."""
+    """Return the names of the shipped systems, such as "argon/liquid-864"."""
     root = shipped_folder()
     return sorted(path.relative_to(root).with_suffix("").as_posix() for path in root.glob("*/*.toml"))
 
@@ -37,13 +37,13 @@ HEAD = ("status", "seconds", "headline", "verdict", "findings")
 
 
 def headed(kind: str, document: Mapping[str, Any]) -> dict[str, Any]:
-    """Return a JSON document with a header that contains its schema (in mdnum/schemas), kind and version."""
+    """Return a JSON document with a header of schema (in mdnum/schemas), kind and version."""
     head = {"schema": f"mdnum/{kind}/1", "kind": kind}
     return {**head, **document, **head}
 
 
 def plain(value: Any) -> Any:
-    """Convert a value for JSON: dataclasses to dictionaries, arrays to lists, non-finite numbers to None.
+    """Convert a value for JSON. Arrays become lists, and non-finite numbers become None.
 
     Raises:
         TypeError: the value cannot be converted.
@@ -68,7 +68,7 @@ def plain(value: Any) -> Any:
 
 @dataclass_transform(frozen_default=True)
 def result(kind: type[T]) -> type[T]:
-    """Make a class a frozen dataclass; its repr shows numbers, short texts, and types of other fields."""
+    """Make a class a frozen dataclass. Its repr shows numbers, short texts and types."""
 
     def __repr__(self: Any) -> str:
         values = ((one.name, getattr(self, one.name)) for one in dataclasses.fields(self))

@@ -1,7 +1,7 @@
-"""Find parameter values at which the decisions of a run change, to within two adjacent floats.
+"""Find parameter values at which the decisions of a run change, between two adjacent floats.
 
-Between two adjacent boundaries, the result of a run is a smooth function of the parameter. At a boundary, two
-adjacent floats lead to different decisions, and every later quantity of the run may jump.
+Between two boundaries, the result of a run is a smooth function of the parameter. At a boundary, decisions
+differ, and every later quantity of the run may jump.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ MOST, MOST_BALL = 24, 64
 
 @dataclass(frozen=True)
 class Side:
-    """A run with the parameter value that is next to a boundary, on one side of the boundary."""
+    """A run with a parameter value next to a boundary, on one side."""
 
     at: float  # the number, as the float next to the boundary
     digest: str  # of its decisions
@@ -48,7 +48,7 @@ class Side:
 
 @dataclass(frozen=True)
 class Boundary:
-    """Two adjacent floats for which runs make different decisions, and the first decision that differs."""
+    """Two adjacent floats with different decisions, and the first decision that differs."""
 
     # below, above: the two sides; above.at is the float after below.at
     below: Side
@@ -72,7 +72,7 @@ class Boundary:
 
 @dataclass(frozen=True)
 class Interval:
-    """An interval of the parameter in which all computed runs make the same decisions."""
+    """A parameter interval in which all computed runs make the same decisions."""
 
     # low, high: its ends; both were run
     low: float
@@ -123,7 +123,7 @@ class BoundaryMap:
 
 
 class NumberLine:
-    """Runs of a system for different parameter values; each value is identified by its ordinal among floats.
+    """Runs of a system for different parameter values. A value is identified by its ordinal among floats.
 
     Args:
         program: the program with the system's own value of the parameter.
@@ -138,7 +138,7 @@ class NumberLine:
         self.known: dict[int, DecisionHistory] = {}
 
     def value(self, place: int) -> float:
-        """Return the float with a given position (ordinal) in the ordered sequence of floats."""
+        """Return the float with a given ordinal."""
         return float(neighbor(np.zeros((), self.number.dtype), place, self.number.dtype))
 
     def places(self, values: Any) -> list[int]:
@@ -146,25 +146,25 @@ class NumberLine:
         return sorted({int(place) for place in ordinal(np.asarray(values, self.number.dtype))})
 
     def at(self, place: int) -> Any:
-        """Return the program for the parameter value with a given position in the sequence of floats."""
+        """Return the program for the parameter value with a given ordinal."""
         return self.number.at(self.value(place))
 
     def run(self, place: int) -> DecisionHistory:
-        """Compute all decisions for the parameter value with a given position in the sequence of floats."""
+        """Compute all decisions for the parameter value with a given ordinal."""
         history = self.at(place).history(self.steps, self.loss)
         self.known[place] = replace(history, marks=history.marks[:0], x=history.x[:0])
         return history
 
     def digest(self, place: int) -> str:
-        """Return the digest of all decisions for the float with a given position in the sequence."""
+        """Return the digest of all decisions for the float with a given ordinal."""
         if place not in self.known:
             self.run(place)
         return self.known[place].digest
 
     def changes(self, a: int, b: int) -> Iterator[tuple[int, int, dict[int, DecisionHistory]]]:
-        """Yield adjacent ordinals whose runs decide differently, in ascending order, and the search's runs.
+        """Yield adjacent ordinals with different decisions, in ascending order, and the search's runs.
 
-        A grid interval is not searched if the runs at both of its ends have the same history of decisions.
+        A grid interval is not searched if both ends have the same history of decisions.
         """
         pending = [(a, b)]
         while pending:
@@ -182,7 +182,7 @@ class NumberLine:
             yield a, b, runs
 
     def boundary(self, below: int, above: int) -> Boundary | None:
-        """Find the first decision that differs between two parameter values; None if a run ends earlier."""
+        """Find the first decision that differs between two parameter values. None if a run ends earlier."""
         places = (below, above)
         runs = [self.run(place) for place in places]
         step = runs[0].first_difference(runs[1])
@@ -223,14 +223,13 @@ def boundaries(
     on: str | Executor | None = None,
     workers: int | None = None,
 ) -> BoundaryMap:
-    """Find the values of a parameter at which the decisions of a run change, within the resolution of a grid.
+    """Find the parameter values at which the decisions of a run change.
 
-    The system is run at every grid value of the parameter. If the histories of decisions at the two ends of a
-    grid interval differ, the interval is bisected until its ends are adjacent floats. If the decisions also
-    change in the other half of a bisected interval, this half is searched later. Boundaries are searched from
-    the lowest parameter value upward; if more exist than were requested, the highest are missing. All runs
-    use the same program as a normal run; to vary the cutoff radius, the program takes the radius as an
-    argument. A new process repeats the runs on both sides of every boundary.
+    The system is run at every grid value of the parameter. A grid interval is bisected if the decisions at
+    its ends differ. Bisection stops at adjacent floats. If decisions also change in the other half, that half
+    is searched later. The search goes from low to high parameter values. If there are more boundaries than
+    requested, the highest are missing. All runs use the program of a normal run. The cutoff radius becomes an
+    argument if it varies. A new process repeats the runs on both sides of every boundary.
 
     Args:
         steps: last step; default the system's own. For arguments not listed here see `mdnum.fork_map`.
@@ -299,7 +298,7 @@ def _run(task: tuple[NumberLine | bytes, int]) -> DecisionHistory:
 def _searched(
     task: tuple[NumberLine | bytes, dict[int, DecisionHistory], int],
 ) -> list[tuple[Boundary | None, dict[int, DecisionHistory]]]:
-    """Find the lowest boundaries in a grid interval; return each with the runs that were made to find it."""
+    """Find the lowest boundaries in a grid interval. Return each with the runs of its search."""
     own, ends, most = task
     line = _line_of(own)
     line.known |= ends
@@ -307,7 +306,7 @@ def _searched(
 
 
 def checked(program: Program, key: str, low: float, high: float) -> Number:
-    """Return the parameter with the given key, after checking that an interval of its values is valid.
+    """Return the parameter with the given key. Check the interval of its values.
 
     Raises:
         InputError: the parameter does not exist, or the interval is invalid (the message gives the reason).
@@ -325,7 +324,7 @@ def checked(program: Program, key: str, low: float, high: float) -> Number:
 
 
 def _grid(line: NumberLine, low: float, high: float, cells: int) -> list[int]:
-    """Return the ordinals of the grid points: evenly spaced floats, or all floats in the interval."""
+    """Return the ordinals of the grid points: evenly spaced floats, or all floats."""
     first, final = line.places([low, high])[0], line.places([low, high])[-1]
     if final - first <= cells:
         return list(range(first, final + 1))
@@ -333,7 +332,7 @@ def _grid(line: NumberLine, low: float, high: float, cells: int) -> list[int]:
 
 
 def _confirmed(system: Any, line: NumberLine, found: list[Boundary], note: Progress) -> list[Boundary]:
-    """Mark each boundary as confirmed or not, by repeating the runs on both sides in a new process."""
+    """Mark each boundary as confirmed or not. The runs on both sides are repeated in a new process."""
     sides = [(edge.below, edge.above) for edge in found]
     values = [side.at for both in sides for side in both]
     digests = iter(digests_elsewhere(system, line.number.key, line.steps, values))
@@ -348,9 +347,9 @@ def _confirmed(system: Any, line: NumberLine, found: list[Boundary], note: Progr
 def digests_elsewhere(
     system: Simulation | BallSystem, key: str, steps: int, values: Sequence[float]
 ) -> Iterator[str]:
-    """Yield digests of all decisions of runs in a new process, to confirm boundaries independently.
+    """Yield digests of all decisions of runs in a new process.
 
-    The new process restores the system bit for bit, and compiles its program again in the same environment.
+    The new process restores the system bit for bit and compiles its program again.
 
     Raises:
         MdnumError: the process failed.

@@ -1,12 +1,12 @@
-"""Gradient methods that make many runs: finite differences with error estimates, and means over replicas.
+"""Gradient methods with many runs: finite differences, and means over replicas.
 
-A replica is the same system with different initial velocities and, with a thermostat, different noise.
-Replicas have different neighbor lists and are therefore run one after another on each device.
+A replica is the same system with other initial velocities and other thermostat noise. Replicas run one after
+another on each device, because their neighbor lists differ.
 
-If a parameter changes, pairs cross the cutoff at other steps. If the force jumps at the cutoff, the loss then
-jumps as a function of the parameter. Between two jumps, the slope of the loss is the derivative at fixed
-decisions. The event-aware gradient is the slope of the loss across many jumps. Finite differences that are
-compared with this gradient must span many jumps.
+If a parameter changes, pairs cross the cutoff at other steps. If the force jumps at the cutoff, the loss
+jumps too. Between two jumps, the slope of the loss is the derivative at fixed decisions. The event-aware
+gradient is the slope of the loss across many jumps. Finite differences that are compared with this gradient
+must span many jumps.
 """
 
 from __future__ import annotations
@@ -66,7 +66,7 @@ def richardson(f: Callable[[float], float], x: float, step: float, levels: int =
     """Differentiate f at x by Richardson's extrapolation of central differences (Ridders 1982).
 
     The finite-difference step decreases by factors of 1.4. The extrapolation with the smallest estimated
-    error, which is returned, balances the truncation error of large steps against the noise of small steps.
+    error is returned.
 
     Args:
         f: function of one number. x: point. step: the largest step. levels: number of steps.
@@ -93,9 +93,9 @@ def richardson(f: Callable[[float], float], x: float, step: float, levels: int =
 
 
 def noise_of(values: Float[np.ndarray, "points"]) -> float:
-    """Estimate the standard deviation of the noise of a function from values at small equal spacings.
+    """Estimate the standard deviation of a function's noise from equally spaced values.
 
-    Finite differences of order k cancel a smooth function and amplify noise by a known factor.
+    Differences of order k cancel a smooth function and amplify noise by a known factor.
 
     Args:
         values: at least 4, so closely spaced that the function is nearly linear over all of them.
@@ -119,14 +119,14 @@ def noise_of(values: Float[np.ndarray, "points"]) -> float:
 
 
 class DifferenceStep(NamedTuple):
-    """Step size for central differences of a function, and standard deviation of its noise."""
+    """Step size for central differences of a function, and its noise (standard deviation)."""
 
     size: float
     noise: float
 
 
 def choose_step(f: Callable[[float], float], x: float, first: float, spacing: float) -> DifferenceStep:
-    """Choose the step size at which truncation error and noise of a central difference are about equal.
+    """Choose the step size with about equal truncation error and noise of a central difference.
 
     Args:
         first: the initial step, which is also the largest, because the function may differ in kind beyond it.
@@ -158,7 +158,7 @@ def choose_step(f: Callable[[float], float], x: float, first: float, spacing: fl
 
 
 def nonzero(problem: Problem, name: str) -> float:
-    """Return the value of a scalar parameter; raise an error if it is 0 (steps are relative to the value).
+    """Return the value of a scalar parameter. Raise an error if it is 0.
 
     Raises:
         InputError: the value is 0.
@@ -174,9 +174,9 @@ def nonzero(problem: Problem, name: str) -> float:
 
 @dataclass(frozen=True)
 class FiniteDifferences(Method):
-    """Gradient method: central differences of the loss at shifted parameters, extrapolated to zero shift.
+    """Gradient method: central differences of the loss, extrapolated to zero shift of the parameter.
 
-    The details of the gradient contain errors, finite-difference steps and the noise of the loss.
+    The details contain errors, finite-difference steps and the noise of the loss.
     """
 
     # the largest step as a share of the parameter; None for one that the noise of the loss and its third
@@ -226,7 +226,7 @@ class FiniteDifferences(Method):
 
 
 def _counter(progress: Progress | None, runs: int, phase: str) -> Callable[[], None]:
-    """Return a function that counts runs and reports progress; this function must be called once per run."""
+    """Return a function that reports progress. Call it once per run."""
     done = 0
 
     def count() -> None:
@@ -292,7 +292,7 @@ class Replicas:
 
 
 def replica(simulation: Simulation, seed: int, settle: int = 0) -> Simulation:
-    """Return the system with new random velocities at its temperature and, with a thermostat, new noise.
+    """Return the system with new random velocities at its temperature. A thermostat gets new noise.
 
     Args:
         seed: of velocities and noise. settle: steps to run before the start.
@@ -314,7 +314,7 @@ def replica(simulation: Simulation, seed: int, settle: int = 0) -> Simulation:
 
 
 def settled(simulation: Simulation, steps: int) -> Simulation:
-    """Return a simulation that starts from the state after the given number of steps.
+    """Return a simulation that starts from the state after `steps` steps.
 
     Raises:
         NumericalError: the run blew up.
@@ -332,7 +332,7 @@ def settled(simulation: Simulation, steps: int) -> Simulation:
 
 @dataclass(frozen=True)
 class Estimate:
-    """Mean over replicas, with the standard error of the mean and the value of each replica."""
+    """Mean over replicas, with its standard error and all values."""
 
     # mean, error: the mean and its standard error, of the shape of the parameter
     mean: Float[np.ndarray, "..."]
@@ -348,9 +348,9 @@ class Estimate:
 
 @dataclass(frozen=True)
 class Ensemble(Method):
-    """Gradient method: average of another method's gradient over replicas, for several numbers of steps.
+    """Gradient method: average of another method's gradient over replicas, at several horizons.
 
-    The details of the gradient contain standard errors, and the number of steps at which noise dominates.
+    The details contain standard errors, and the number of steps at which noise dominates.
     """
 
     method: Method = field(default_factory=EventAware)  # applied to each replica
@@ -394,7 +394,7 @@ class Ensemble(Method):
         return replace(made, description=f"the mean over replicas of {self.method.description}")
 
     def _horizons(self, problem: Problem) -> list[int]:
-        """Return numbers of steps (horizons), shortest first, for which the loss uses at least one frame."""
+        """Return numbers of steps (horizons) for which the loss uses a frame, shortest first."""
         found = []
         for k in reversed(range(self.halvings + 1)):
             steps = problem.steps >> k
@@ -408,7 +408,7 @@ class Ensemble(Method):
 
 
 def each(method: Method, problems: Sequence[Problem], names: Sequence[str]):
-    """Distribute the problems over all devices, and yield their gradients in the same order."""
+    """Distribute the problems over all devices. Yield their gradients in the same order."""
     devices = jax.local_devices()
     if len(devices) < 2:
         yield from (method(one, names) for one in problems)
@@ -423,7 +423,7 @@ def each(method: Method, problems: Sequence[Problem], names: Sequence[str]):
 
 
 def _lost(rows: Sequence[dict[str, Any]], name: str) -> int | None:
-    """Return the number of steps at which the standard error starts to exceed the mean, or None."""
+    """Return the number of steps from which the standard error exceeds the mean, or None."""
     mine = [row for row in rows if row["name"] == name]
     kept = [k for k, row in enumerate(mine) if row["error"] < row["mean"]]
     after = max(kept, default=-1) + 1
@@ -432,11 +432,11 @@ def _lost(rows: Sequence[dict[str, Any]], name: str) -> int | None:
 
 @dataclass(frozen=True)
 class SmoothedDifferences(Method):
-    """Gradient method: mean over replicas of central differences with parameter steps that span many flips.
+    """Gradient method: mean over replicas of central differences that span many flips.
 
     The two runs of a difference use the same random numbers. Differences with steps h and h/2 are
-    extrapolated to h = 0. The result is the extrapolation from the widest steps that agrees with those from
-    all narrower steps within twice the standard error. Smaller steps increase the noise due to single flips.
+    extrapolated to h = 0. The result is the extrapolation from the widest steps that agrees with all narrower
+    steps, within twice the standard error. Smaller steps increase the noise due to single flips.
     """
 
     relative: float = 0.002  # the widest step as a share of the parameter
@@ -483,7 +483,7 @@ class SmoothedDifferences(Method):
 
 
 def _values(starts: Sequence[Problem], values: dict[str, float], count: Callable[[], None]):
-    """Return the loss of each initial state at given parameter values, and all crossings (step, i, j)."""
+    """Return the loss of each initial state at given parameter values, with all crossings (step, i, j)."""
     found = []
     for start in starts:
         made, met = start.at(values), set()
@@ -500,14 +500,14 @@ def _values(starts: Sequence[Problem], values: dict[str, float], count: Callable
 
 
 def _share(high, low) -> float | None:
-    """Return the fraction of cutoff crossings that do not occur at the same time step in both runs."""
+    """Return the fraction of cutoff crossings that do not occur in both runs at the same step."""
     total = sum(len(a[1]) + len(b[1]) for a, b in zip(high, low, strict=True))
     differing = sum(len(a[1] ^ b[1]) for a, b in zip(high, low, strict=True))
     return differing / total if total else None
 
 
 def _chosen(found: Float[np.ndarray, "steps replicas"]) -> tuple[Estimate, float, int]:
-    """Choose one extrapolated difference; return the derivative, its error and the index of its step size."""
+    """Choose one extrapolated difference. Return the derivative, its error and the index of its step."""
     if len(found) == 1:
         only = Estimate.from_replicas(found[0])
         return only, float(only.error), 0

@@ -1,9 +1,8 @@
-"""A run recorded for gradients: its time steps, in forward or reverse order, and sums for the loss.
+"""A run recorded for gradients: its time steps, in either order, and sums for the loss.
 
-Recorded stretches of steps are kept in memory until the memory limit is reached. Stretches that do not fit
-into memory are computed again from the state at their first step. Repeated steps agree bit for bit with the
-first run, because program, state and neighbor list are the same. A run in fixed-point numbers need not be
-stored. The steps of such a run are reversed, and must lead back to exactly the initial state.
+Recorded stretches of steps are kept in memory up to the memory limit. Other stretches are computed again from
+the state at their first step. Repeated steps agree with the first run bit for bit. A run in fixed-point
+numbers need not be stored. The reversed run must lead back to exactly the initial state.
 """
 
 from __future__ import annotations
@@ -39,7 +38,7 @@ _FINGERPRINTS = 256
 
 @dataclass(frozen=True)
 class TapeStretch:
-    """States and cutoff decisions of successive steps with one neighbor list, in the list's atom order."""
+    """States and cutoff decisions of successive steps with one neighbor list, in its atom order."""
 
     # first, rows: its first step and the number of rows in use; those beyond are void
     first: int
@@ -67,7 +66,7 @@ class TapeStretch:
         return sum(array.nbytes for array in jax.tree.leaves(kept))
 
     def cut(self, room: int | None = None) -> TapeStretch:
-        """Return a copy whose arrays have `room` rows; by default, one row for each recorded step."""
+        """Return a copy with `room` rows. The default is one row for each recorded step."""
 
         def copied(rows: np.ndarray) -> np.ndarray:
             kept = np.zeros((room or self.rows, *rows.shape[1:]), rows.dtype)
@@ -77,7 +76,7 @@ class TapeStretch:
         return replace(self, **{name: jax.tree.map(copied, getattr(self, name)) for name in _COLUMNS})
 
     def roomy(self) -> TapeStretch:
-        """Return a copy padded to a standard number of steps, which reduces the number of compilations."""
+        """Return a copy padded to a standard number of steps, for fewer compilations."""
         columns = jax.tree.leaves([getattr(self, name) for name in _COLUMNS])
         per_row = sum(column[0].nbytes for column in columns)
         return self.cut(room_for(self.rows - 1, per_row))
@@ -89,11 +88,11 @@ class TapeStretch:
 
     @property
     def columns(self):
-        """Recorded arrays: step, x, v, images, potential, virial, cell, and the inputs of each step."""
+        """Recorded arrays: step, x, v, images, potential, virial, cell, and the inputs of steps."""
         return (self.steps, *(getattr(self, name) for name in ("x", "v", "images", *_COLUMNS[4:])))
 
     def cell_of(self, row: int, cell: Cell) -> Cell:
-        """Return the simulation box at the step of a row; row -1 is the step before the first row.
+        """Return the simulation box at a row. Row -1 is the step before the first row.
 
         Args:
             cell: the box of a run whose box does not move.
@@ -108,7 +107,7 @@ _COLUMNS = ("x", "v", "images", "bits", "potential", "virial", "cell", "inputs")
 
 
 def stretch_of(segment: Segment, start: Start, ledger: FlipTable | None = None) -> TapeStretch:
-    """Copy the record of a segment of the run, because the memory of the record is reused."""
+    """Copy the record of a segment, because its memory is reused."""
     columns: dict[str, Any] = {name: getattr(segment.record, name) for name in _COLUMNS}
     x_before = np.asarray(start.state.x_before)[:, segment.table.order]
     before = jax.tree.map(np.asarray, start.state.cells[len(start.state.cells) > 1])
@@ -120,22 +119,20 @@ def stretch_of(segment: Segment, start: Start, ledger: FlipTable | None = None) 
 
 
 class Pace(NamedTuple):
-    """Number of steps between the frames that a loss uses, and the first step that the loss uses."""
+    """Number of steps between the frames that a loss uses, and its first step."""
 
     between: Int[Array, ""]  # steps from one frame to the next; 0 where they are not a series at equal times
     first: Int[Array, ""]  # step of the first frame
 
     def share(self, step: Int[Array, ""], timestep: Float[Array, ""]) -> Float[Array, ""]:
-        """Return the number of the loss's frames per unit of time near a step. If a jump of the energy comes
-        earlier by a time dt, the number of frames after the jump increases by dt times the result.
-        """
+        """Return the number of the loss's frames per unit of time near a step."""
         within = (self.between > 0) & (step > self.first - self.between)
         time = jnp.maximum(self.between, 1).astype(jnp.float64) * timestep.astype(jnp.float64)
         return jnp.where(within, 1 / time, 0.0)
 
 
 def pace_of(loss: Loss, steps: int) -> Pace:
-    """Return the number of steps between the frames that a loss uses in a run of `steps` steps."""
+    """Return the number of steps between the frames that a loss uses."""
     seen = np.flatnonzero(loss.looks_at(np.arange(steps + 1), steps))
     spacings = np.unique(np.diff(seen))
     between = int(spacings[0]) if len(spacings) == 1 else 0
@@ -217,13 +214,14 @@ class RunTape:
 
     @property
     def replayed(self) -> int:
-        """Number of stretches of steps that were not stored and are run again in a reverse pass."""
+        """Number of stretches that a reverse pass runs again, because they were not stored."""
         return sum(isinstance(one, tuple) for one in self._made)
 
     @property
     def jumps_unseen(self) -> tuple[float, float]:
-        """Derivatives of the loss with respect to energy and virial of a frame; (0, 0) if frames are equally
-        spaced. For losses of a single frame, gradients omit jumps of energy and virial at flips.
+        """Derivatives of the loss by energy and virial of a frame. (0, 0) for equally spaced frames.
+
+        For losses of a single frame, gradients omit jumps of energy and virial at flips.
         """
         if int(self.pace.between) > 0:
             return 0.0, 0.0
@@ -253,7 +251,7 @@ class RunTape:
         return map(self._whole, self._made)
 
     def seen(self, stretch: TapeStretch) -> Bool[np.ndarray, "room"]:
-        """Return, for each step of a stretch of the run, whether the loss uses this step."""
+        """Return for each step of a stretch whether the loss uses it."""
         steps = stretch.steps
         return self.loss.looks_at(steps, self.steps) & (np.arange(len(steps)) < stretch.rows)
 
@@ -270,8 +268,8 @@ class RunTape:
 class ReversibleTape(RunTape):
     """A completed run in fixed-point numbers, which is reversed instead of stored.
 
-    The method `backward` reverses the steps with new neighbor lists, and raises NumericalError if states
-    differ from those of the forward run.
+    The method `backward` reverses the steps with new neighbor lists. It raises NumericalError if a state
+    differs from the forward run.
 
     Attributes:
         baths: bits that a thermostat's friction discarded, by step; only this memory grows with the run.
@@ -302,11 +300,11 @@ class ReversibleTape(RunTape):
 
     @property
     def nbytes(self) -> int:
-        """Memory (bytes) for bits that the thermostat's friction discarded, which grows with each step."""
+        """Memory (bytes) of bits that friction discarded. It grows with each step."""
         return sum(bath.nbytes for bath in self.baths.values())
 
     def forward(self) -> Iterator[TapeStretch]:
-        """Run the steps again, because their states were not stored, and yield the stretches in order."""
+        """Run the steps again, because states were not stored. Yield the stretches in order."""
         return RunTape(self.simulation, self.loss, self.steps, flips=self.flips).forward()
 
     def backward(self) -> Iterator[TapeStretch]:
@@ -348,7 +346,7 @@ class ReversibleTape(RunTape):
 
 
 def fingerprint(order, *parts) -> bytes:
-    """Return a hash of a state with atoms in the user's order; the sign of a zero is ignored."""
+    """Return a hash of a state in the user's order of atoms. The sign of a zero is ignored."""
     digest = hashlib.blake2b(digest_size=8)
     for part in map(np.asarray, parts):
         out = np.empty_like(part)
@@ -358,20 +356,20 @@ def fingerprint(order, *parts) -> bytes:
 
 
 def listed(simulation: Simulation, table: PairTable) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return each pair of a neighbor list once: indices of both atoms in the list's order, and pair type."""
+    """Return each listed pair once: indices of both atoms in the list's order, and pair type."""
     first, second, i, j = table.listed(simulation.channels)
     return first, second, np.asarray(simulation.type_of(i, j), np.int64)
 
 
 def frame_of(row, order: Int[Array, "atoms"], matrix: Float[Array, "3 3"]) -> LossFrame:
-    """Convert a recorded step to a `LossFrame`: positions unwrapped, atoms in the user's order."""
+    """Convert a recorded step to a `LossFrame`. Positions are unwrapped, atoms in the user's order."""
     step, x, v, images, potential, virial = row[:6]
     whole = x + (matrix.T @ images.astype(matrix.dtype)).astype(x.dtype)
     return LossFrame(step, unsorted(whole, order), unsorted(v, order), potential, virial)
 
 
 def seen_in(row, order: Int[Array, "atoms"], origin: LossFrame, around: LossContext):
-    """Return the arguments of `Loss.observe` for a recorded step: frame, first frame and context."""
+    """Return the arguments of `Loss.observe` for a step: frame, first frame and context."""
     around = in_box(around, row[6]) if row[6].size else around
     return frame_of(row, order, around.matrix), origin, around
 
@@ -397,7 +395,7 @@ def in_box(around: LossContext, matrix: Float[Array, "3 3"]) -> LossContext:
 
 
 def surroundings(simulation: Simulation) -> LossContext:
-    """Return the context of a loss (masses, initial box, constants, time step) of a simulation."""
+    """Return the context of a loss: masses, initial box, constants and time step."""
     cell = simulation.cell
     volume = cell.volume if all(simulation.pbc) else 0.0
     parts = (
@@ -414,7 +412,7 @@ def no_sums(loss: Loss, origin: LossFrame, around: LossContext) -> Any:
 
 
 def frame_of_start(start: Start, simulation: Simulation) -> LossFrame:
-    """Return the frame of step 0, with NaN for energies, because they have not been computed yet."""
+    """Return the frame of step 0. Its energies are NaN, because they are not yet known."""
     state = start.state
     matrix = jnp.asarray(np.asarray(simulation.cell.matrix), jnp.float64)
     whole = state.x + (matrix.T @ state.images.astype(matrix.dtype)).astype(state.x.dtype)

@@ -1,8 +1,8 @@
-"""Simulation boxes: lattice vectors, periodicity, wrapping and minimum image, on the host and in jit.
+"""Simulation boxes: lattice vectors, wrapping and minimum image, on the host and in jit.
 
 Code on the host and in jit executes the same operations in the same order. Lattice vectors are subtracted as
-n * L, where n is -1, 0 or 1 for wrapped positions. The products n * L are exact. Fused and separate
-operations therefore give identical results, and numpy agrees with jit bit for bit.
+n * L. For wrapped positions, n is -1, 0 or 1. The products n * L are exact. Numpy and jit therefore agree bit
+for bit.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from mdnum.numerics.rounding import Reach
 
 
 class Cell(eqx.Module):
-    """A parallelepiped simulation box, with numpy arrays on the host or jax arrays in jit."""
+    """A parallelepiped simulation box. Its arrays are numpy's on the host or jax's in jit."""
 
     # lattice vectors as rows, length, shape (3, 3); a free axis may hold a zero vector
     matrix: Float[np.ndarray | jax.Array, "3 3"]
@@ -78,12 +78,12 @@ class Cell(eqx.Module):
         return widths
 
     def is_narrow(self, radius):
-        """Return True if a radius exceeds half a width of the box, so that the minimum image misses pairs."""
+        """Return True if a radius exceeds half a width of the box. The minimum image then misses pairs."""
         return ((2 * radius) ** 2 * (self.inverse**2).sum(0) > 1).any()
 
     @property
     def nearby2(self):
-        """Square of half the smallest perpendicular width, reduced to allow for rounding; for use in jit.
+        """Square of half the smallest perpendicular width, slightly reduced for rounding (in jit).
 
         `minimum_image` returns displacements shorter than half a width unchanged, bit for bit.
         """
@@ -91,14 +91,14 @@ class Cell(eqx.Module):
 
     @property
     def volume(self) -> float:
-        """Volume spanned by the three lattice vectors, length³; NaN if a lattice vector is missing (zero)."""
+        """Volume of the three lattice vectors, length³. NaN if a lattice vector is missing (zero)."""
         volume = float(abs(np.linalg.det(np.asarray(self.matrix))))
         return volume if volume > 0 else float("nan")
 
     def reach(self, positions: Float[np.ndarray, "atoms 3"]) -> Reach:
         """Return the largest coordinates and lattice vectors, from which rounding bounds are computed.
 
-        The largest coordinates along periodic axes follow from the box. Along nonperiodic axes, the returned
+        The largest coordinates along periodic axes follow from the box. Along nonperiodic axes, the
         coordinates include a margin for motion, equal to the extent of the atoms.
 
         Args:
@@ -125,8 +125,8 @@ class Cell(eqx.Module):
     def minimum_image(self, x, y, z):
         """Return the components of the minimum image of a displacement.
 
-        The minimum image is correct if the distance to the nearest image is less than half the smallest
-        perpendicular width. Calling functions reject cutoffs longer than this half width.
+        The minimum image is correct if the nearest image is closer than half the smallest perpendicular
+        width. Calling functions reject cutoffs longer than this half width.
         """
         if not any(self.pbc):
             return x, y, z
@@ -135,14 +135,14 @@ class Cell(eqx.Module):
         return _subtract(lattice, x, y, z, _images(lattice, x, y, z, rounding))
 
     def deformation(self, now: Cell):
-        """Return the deformation F from this box to another, shape (3, 3): new lattice rows = old rows @ F.
+        """Return the deformation F to another box, shape (3, 3): new lattice rows = old rows @ F.
 
         Directions along nonperiodic axes do not change. For equal boxes, the deformation is the identity.
         """
         return np.eye(3) + self.inverse @ (now.matrix - self.matrix)
 
     def deformed(self, by) -> Cell:
-        """Return the box after its lattice vectors (rows) are multiplied by a deformation (inside jit).
+        """Return the box with its lattice vectors (rows) multiplied by a deformation (inside jit).
 
         Args:
             by: deformation, shape (3, 3), float64. If orthorhombic is True, the deformed box must be
@@ -151,7 +151,7 @@ class Cell(eqx.Module):
         return self.spanned(self.matrix @ by)
 
     def spanned(self, matrix) -> Cell:
-        """Return a box with new lattice vectors (rows) and the same periodic axes (for use inside jit)."""
+        """Return a box with new lattice vectors (rows) and the same periodic axes (inside jit)."""
         flags = np.array(self.pbc)
         rows = jnp.where(flags[:, None], matrix, 0.0)
         # of the products of rows: a free axis, which has none, keeps an inverse of 0
@@ -160,9 +160,9 @@ class Cell(eqx.Module):
         return Cell(matrix, rows.T @ crossed.T / (square[0] @ crossed[0]), self.pbc, self.orthorhombic)
 
     def spent(self, x, reference: Cell, home, r_list):
-        """Return strain_loss / 2 + the largest displacement relative to the box (for use inside jit).
+        """Return strain_loss / 2 + the largest displacement relative to the box (inside jit).
 
-        A neighbor list is complete as long as the sum returned by `spent` is at most half the skin.
+        A neighbor list is complete while `spent` is at most half the skin.
 
         Args:
             x, home: present positions, in this box, and positions when the list was built, in the box
@@ -176,7 +176,7 @@ class Cell(eqx.Module):
         return self.astype(x.dtype).farthest(moved) + 0.5 * strain_loss(reference, self, r_list)
 
     def farthest(self, moved):
-        """Return the length, in float64, of the longest minimum-image displacement (for use inside jit)."""
+        """Return the length of the longest minimum-image displacement in float64 (inside jit)."""
         d = self.minimum_image(*moved)
         return jnp.sqrt(jnp.max(d[0] * d[0] + d[1] * d[1] + d[2] * d[2])).astype(jnp.float64)
 
@@ -192,7 +192,7 @@ class Cell(eqx.Module):
 
 
 def _images(lattice, x, y, z, rounding):
-    """Return rounded lattice coordinates of a vector: the number of lattice vectors to subtract per axis."""
+    """Return the number of lattice vectors to subtract from a vector, per axis."""
     _, m, _, orthorhombic = lattice
     if orthorhombic:
         return rounding(x * m[0, 0]), rounding(y * m[1, 1]), rounding(z * m[2, 2])
@@ -211,7 +211,7 @@ def _subtract(lattice, x, y, z, n):
 
 @njit(inline="always")
 def nearest_image(lattice, x, y, z):
-    """Return the minimum image in compiled code, bit for bit equal to that of `Cell.minimum_image`.
+    """Return the minimum image in compiled code. It equals `Cell.minimum_image` bit for bit.
 
     Args:
         lattice: the box as returned by `box_of`, in the dtype of the displacement.
@@ -235,7 +235,7 @@ def nearest_image(lattice, x, y, z):
 
 
 def stacked(cells: Sequence[Cell], dtype: DTypeLike = np.float64):
-    """Convert one box, or one box per row, to arrays that compiled loops accept (see `box_of`)."""
+    """Convert one box, or one per row, to arrays for compiled loops (see `box_of`)."""
     numbers = np.array([(cell.matrix, cell.inverse) for cell in cells], dtype)
     return numbers, cells[0].pbc, all(cell.orthorhombic for cell in cells)
 
@@ -244,7 +244,7 @@ def stacked(cells: Sequence[Cell], dtype: DTypeLike = np.float64):
 def box_of(boxes, row):
     """Return one of several stacked boxes: lattice vectors, inverse, periodicity and orthorhombic flag.
 
-    The function returns tuples, because reference counts of arrays would slow down a compiled loop.
+    Tuples are returned, because reference counts of arrays slow down a compiled loop.
     """
     numbers, pbc, orthorhombic = boxes
     a, m = numbers[row % len(numbers), 0], numbers[row % len(numbers), 1]
@@ -254,7 +254,7 @@ def box_of(boxes, row):
 
 
 class HostCell:
-    """Fast host version of the methods of `Cell`, for many calls with few positions in one dtype."""
+    """Fast version of the methods of `Cell` on the host, for calls with few positions."""
 
     def __init__(self, cell: Cell, dtype: DTypeLike = np.float64):
         self.dtype = np.dtype(dtype)
@@ -264,7 +264,7 @@ class HostCell:
     def displacement(
         self, start: Float[np.ndarray, "... 3"], end: Float[np.ndarray, "... 3"]
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Return the components of the minimum image of end - start, bit for bit as in the force loop."""
+        """Return the components of the minimum image of end - start, with the bits of the force loop."""
         start, end = np.asarray(start, self.dtype), np.asarray(end, self.dtype)
         x, y, z = (end[..., k] - start[..., k] for k in range(3))
         if not any(self._lattice[2]):
@@ -275,11 +275,11 @@ class HostCell:
 def wrap_positions(
     cell: Cell, positions: Float[np.ndarray, "atoms 3"]
 ) -> tuple[Float[np.ndarray, "atoms 3"], Int[np.ndarray, "atoms 3"]]:
-    """Wrap positions, even from far outside the box; also return the numbers of lattice vectors subtracted.
+    """Wrap positions. Also return the numbers of lattice vectors subtracted.
 
     Error: the first pass subtracts the product n * L, which is rounded. A second pass wraps positions that
-    the rounding of n * L left outside the box. A wrapped coordinate may equal the edge length L after L is
-    added to a tiny negative number.
+    rounding left outside the box. A wrapped coordinate may equal the edge length L, if L is added to a tiny
+    negative number.
     """
     wrapped = np.array(positions, np.float64, copy=True)
     images = np.zeros(wrapped.shape, np.int64)
@@ -296,27 +296,27 @@ def displacement(
     end: Float[np.ndarray, "... 3"],
     dtype: DTypeLike = np.float64,
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return the components of the minimum image of end - start, bit for bit as in the force loop."""
+    """Return the components of the minimum image of end - start, with the bits of the force loop."""
     return HostCell(cell, dtype).displacement(start, end)
 
 
 def transformed(x, by):
-    """Multiply positions (rows) by a deformation matrix; return their components (for use inside jit)."""
+    """Multiply positions (rows) by a deformation matrix. Return their components (inside jit)."""
     # one product: XLA fuses sums that are written out with what makes their operands, again for each row
     return jnp.matmul(by.astype(x.dtype).T, x, precision="highest")
 
 
 def strain_loss(reference: Cell, now: Cell, r_list):
-    """Return an upper bound on how much a deformation of the box can shorten a distance of r_list.
+    """Return an upper bound on how much a deformation of the box shortens a distance of r_list.
 
-    The deformation F maps a vector of length r_list to a vector of at least length sigma_min(F) * r_list. A
-    neighbor list is complete as long as `strain_loss` plus twice the largest displacement (relative to the
-    box) does not exceed the skin. `strain_loss` works on the host and inside jit.
+    A vector of length r_list has at least the length sigma_min(F) * r_list after the deformation F. A
+    neighbor list is complete while `strain_loss` plus twice the largest displacement (relative to the box) is
+    at most the skin. `strain_loss` works on the host and inside jit.
 
-    The upper bound follows from sigma_min(F) >= lambda_min(S) >= t - sqrt(2/3) |S - t|, where S is the
-    symmetric part of F, t a third of the trace of F, and |.| the Frobenius norm. The upper bound requires no
-    matrix decomposition. If the box keeps its shape, the upper bound is exact. If the shape changes, the
-    error of the bound is at most 0.41 |S - t| plus the square of the rotation angle.
+    The bound uses sigma_min(F) >= lambda_min(S) >= t - sqrt(2/3) |S - t|. S is the symmetric part of F, t a
+    third of the trace of F, and |.| the Frobenius norm. The upper bound requires no matrix decomposition. If
+    the box keeps its shape, the upper bound is exact. If the shape changes, the error is at most 0.41 |S - t|
+    plus the square of the rotation angle.
 
     Source: kUPS issue 263, `2 max|u| + r_list max(0, 1 - sigma_min(F)) <= r_list - r_cut`.
     """
@@ -328,9 +328,9 @@ def strain_loss(reference: Cell, now: Cell, r_list):
 
 
 def complete(cell: Float[np.ndarray, "3 3"], pbc: Bool[np.ndarray, "3"]) -> Float[np.ndarray, "3 3"]:
-    """Replace each lattice vector of a nonperiodic axis by a unit vector perpendicular to the other vectors.
+    """Replace the lattice vectors of nonperiodic axes by unit vectors perpendicular to the others.
 
-    A tilted lattice vector of a nonperiodic axis would change the images chosen along periodic axes.
+    A tilted vector of a nonperiodic axis would change the images along periodic axes.
 
     Args:
         cell: lattice vectors as rows, length; rows of nonperiodic axes are ignored.

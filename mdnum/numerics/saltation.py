@@ -1,11 +1,11 @@
-"""Saltation: the change of a tangent vector (a perturbation) when the trajectory passes an event.
+"""Saltation: the change of a tangent vector when the trajectory passes an event.
 
-A perturbed trajectory reaches a threshold at a different time than the unperturbed trajectory. Between these
-two arrival times, only one of the two trajectories follows the new equation of motion. To first order, the
-difference between the arrival times changes the tangent vector by a rank-one term. Derivatives of a
-time-stepping program lack the rank-one term, because time steps do not move with the event.
+A perturbed trajectory reaches a threshold at a different time than the trajectory itself. In between, only
+one of the two trajectories follows the new equation of motion. To first order, the difference in time changes
+the tangent vector by a rank-one term. Derivatives of a time-stepping program lack the rank-one term, because
+time steps do not move with the event.
 
-The functions accept numpy and jax arrays with any number of leading batch axes, also inside jit.
+The functions accept numpy and jax arrays with leading batch axes, also inside jit.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ GRAZING = 1e-8
 def grazing(
     flow: Float[Any, "*batch state"], normal: Float[Any, "*batch state"], limit: float = GRAZING
 ) -> Bool[Any, "*batch"]:
-    """Return whether the trajectory only grazes the threshold: n · F- is 0, so no saltation term exists.
+    """Return whether the trajectory only grazes the threshold. No saltation term exists if n · F- is 0.
 
     The result is also True if the flow F- or the normal n is zero or not finite.
     """
@@ -37,7 +37,7 @@ def time_shift(
     normal: Float[Any, "*batch state"],
     threshold_rate: Any = 0.0,
 ) -> Float[Any, "*batch"]:
-    """Return the change of the event time, -(n · dx + dc) / (n · F-), for a tangent vector dx.
+    """Return the change of the event time, -(n · dx + dc) / (n · F-), for a tangent dx.
 
     Args:
         tangent: dx, the perturbation just before the event.
@@ -65,12 +65,12 @@ def carry(
     reset_rate: Any = 0.0,
     threshold_rate: Any = 0.0,
 ) -> Float[Any, "*batch state"]:
-    """Return the tangent vector after an event, DR dx + dR - (F+ - DR F-) dt, with dt from `time_shift`.
+    """Return the tangent vector after an event: DR dx + dR - (F+ - DR F-) dt.
 
-    The result is the product of the saltation matrix Xi = DR + (F+ - DR F-) n^T / (n^T F-) and dx. The
-    saltation matrix is never formed, so the function can be used for many atoms. For a ball with coefficient
-    of restitution e that hits the floor at velocity v, Xi is [[-e, 0], [-(1 + e) g / v, -e]]. For a force
-    that jumps from a to b at a distance that is crossed at speed v, Xi is [[1, 0], [(b - a) / v, 1]].
+    The result is Xi dx with the saltation matrix Xi = DR + (F+ - DR F-) n^T / (n^T F-). The time dt is that
+    of `time_shift`. The matrix Xi is never formed, so the function can be used for many atoms. For a ball
+    with restitution e that hits the floor at velocity v, Xi is [[-e, 0], [-(1 + e) g / v, -e]]. For a force
+    that jumps from a to b at crossing speed v, Xi is [[1, 0], [(b - a) / v, 1]].
 
     Args:
         reset: DR, Jacobian of the reset (state after with respect to state before); None for the identity.

@@ -1,4 +1,4 @@
-"""Checkpoint file from which a killed run is resumed: exact arrays and plain values in an npz file."""
+"""Checkpoint file of a run: exact arrays and plain values in an npz file."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ _META, _STORE = "mdnum meta", "mdnum store"
 def write(
     path: Path, state: Mapping[str, Any], store: Mapping[str, Any], beside: Mapping[str, list[str]]
 ) -> None:
-    """Write a checkpoint file, and list in the manifest all files written since the previous checkpoint.
+    """Write a checkpoint file. List all files written since the previous one in the manifest.
 
     Args:
         state: state of the run: arrays, and values that JSON can represent.
@@ -119,7 +119,7 @@ _HEADER = struct.Struct("<qq")
 
 
 class FrameFile:
-    """Writer of the trajectory file `trajectory.traj`, which is opened when the first frame is written."""
+    """Writer of `trajectory.traj`. The file is opened when the first frame is written."""
 
     def __init__(self, path: Path):
         self.path = path
@@ -146,7 +146,7 @@ class FrameFile:
                 raise
 
     def mark(self) -> tuple[int, int, int]:
-        """Return the number of frames, the offset table's position, and the size of the trajectory file."""
+        """Return the number of frames, the position of the offset table, and the file size."""
         if not self.path.exists() or self.path.stat().st_size < _FRAMES_AT + _HEADER.size:
             return (0, 0, 0)
         with opened(self.path) as file:
@@ -155,9 +155,9 @@ class FrameFile:
         return (frames, table, self.path.stat().st_size)
 
     def truncate(self, mark: tuple[int, int, int]) -> None:
-        """Restore the file to the state given by `mark`, and remove all later frames, even incomplete ones.
+        """Restore the file to the state of `mark`. All later frames are removed, even incomplete ones.
 
-        ASE moves its offset table as the file grows, so `mark` includes the position of this table.
+        `mark` includes the position of ASE's offset table, because ASE moves the table.
         """
         self.close()
         frames, table, size = mark

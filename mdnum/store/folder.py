@@ -1,4 +1,4 @@
-"""Run folder: the files that a run writes, that reports read, and from which a killed run is resumed."""
+"""Run folder: all files of a run, for reports and for resuming."""
 
 from __future__ import annotations
 
@@ -62,7 +62,7 @@ _EDITED = (SYSTEM_FILE, "log.txt")
 
 
 def system_tables(file: Path) -> dict[str, Any]:
-    """Return the tables of system.toml (or of the description of a simulation) in a run folder.
+    """Return the tables of system.toml in a run folder, or of the simulation's description.
 
     Raises:
         FolderError: the file is not valid TOML or JSON.
@@ -82,10 +82,9 @@ def _parsed(file: Path, text: str) -> Any:
 class RunFolder:
     """The folder of a run on disk.
 
-    Rows, frames and log lines can be appended at any time, and become permanent with the next checkpoint. A
-    killed run is resumed from its last checkpoint by `resume`, which removes data written later. A resumed
-    run has the same results as a run that was not killed. Use `create` for a new run, and `open` to read or
-    resume an existing run.
+    Rows, frames and log lines become permanent with the next checkpoint. `resume` continues a killed run from
+    its last checkpoint. `resume` removes data written later. A resumed run has the same results as an
+    uninterrupted run. Use `create` for a new run, and `open` for an existing run.
     """
 
     def __init__(self, path: Path, layout: Layout | None = None):
@@ -191,18 +190,18 @@ class RunFolder:
         return self._layout
 
     def read_as(self, layout: Layout) -> None:
-        """Read this folder in the present format, even if an older version of mdnum has written it."""
+        """Read this folder in the present format, even if it has an older format."""
         self._layout = layout
 
     @property
     def kind(self) -> str:
-        """Kind of the run folder, which is declared by the command that created the folder."""
+        """Kind of the run folder. The command that created it sets the kind."""
         return self.layout.kind
 
     # -- writing ---------------------------------------------------------------------------------
 
     def append(self, table: str, columns: Mapping[str, Any]) -> None:
-        """Append rows to a table of the run folder; rows stay in memory until the next checkpoint.
+        """Append rows to a table. Rows stay in memory until the next checkpoint.
 
         Args:
             columns: equally long arrays by column name, at least the declared ones.
@@ -231,11 +230,10 @@ class RunFolder:
         _LOGGER.debug("%s: %s", self.path.name, printable(line))
 
     def checkpoint_due(self) -> bool:
-        """Return True if the last checkpoint is so old that a new one is due.
+        """Return True if a new checkpoint is due.
 
-        The interval between checkpoints is the largest of 2 s, 1 % of the run's duration, and 50 times the
-        duration of the last checkpoint. A killed run loses about 1 % of its computing time, and a run of
-        several days has only about a thousand part files.
+        The interval between checkpoints is 2 s, 1 % of the run's duration, or 50 times the duration of the
+        last checkpoint. The largest of the three is used. A killed run loses about 1 % of its computing time.
         """
         now = time.monotonic()
         due = now - self._written >= max(2.0, 0.01 * (now - self._began), 50 * self._cost)
@@ -243,7 +241,7 @@ class RunFolder:
         return due
 
     def checkpoint(self, state: Mapping[str, Any], force: bool = False) -> bool:
-        """Save the state and all appended data as a checkpoint from which a killed run can be resumed.
+        """Save the state and all appended data, so that a killed run can be resumed.
 
         Args:
             state: arrays (numpy, jax) and plain values (numbers, text, lists, dicts), which `load_checkpoint`
@@ -264,7 +262,7 @@ class RunFolder:
         return True
 
     def checkpoint_beside(self, state: Callable[[], Mapping[str, Any]]) -> None:
-        """Write a checkpoint in a background thread, which also calls the function that returns the state.
+        """Write a checkpoint in a background thread. The thread also calls `state`.
 
         An error in the thread is raised at the next checkpoint or in `finalize`.
         """
@@ -294,7 +292,7 @@ class RunFolder:
         self._writing = self._beside.submit(write)
 
     def finalize(self) -> None:
-        """Finish the folder: merge part files into one parquet file per table; resuming remains possible."""
+        """Merge part files into one parquet file per table. The run can still be resumed."""
         if self._pending is not None and self._pending[1] == self._rows():
             self.checkpoint(self._pending[0], force=True)
         for name in self.layout.always:
@@ -308,18 +306,18 @@ class RunFolder:
         self.close()
 
     def flush(self, *last: str) -> None:
-        """Write all appended rows; the tables in `last` are written after all other tables."""
+        """Write all appended rows. The tables in `last` are written last."""
         for name in sorted(self._streams, key=last.count):
             self._streams[name].flush()
 
     def merge(self) -> None:
-        """Merge each table into one file, which can be read before the run folder is finished."""
+        """Merge each table into one file, which can be read while the run goes on."""
         self._settle()
         for stream in self._streams.values():
             stream.merge()
 
     def close(self) -> None:
-        """Close all files and release the lock; rows appended after the last checkpoint are lost."""
+        """Close all files and release the lock. Rows after the last checkpoint are lost."""
         # also for one that began as the run was interrupted
         self._beside.shutdown()
         self._frames.close()
@@ -331,7 +329,7 @@ class RunFolder:
         self._log = self._lock = None
 
     def write_summary(self, summary: Mapping[str, Any]) -> None:
-        """Write summary.json; NaN and infinity are written as null, because JSON cannot represent them."""
+        """Write summary.json. NaN and infinity become null."""
         self._write_json("summary.json", summary)
         made = manifest.load(self.path) if self._owner else None
         if made is not None and made.finished:
@@ -339,7 +337,7 @@ class RunFolder:
             self._list_files()
 
     def write_provenance(self, provenance: Mapping[str, Any]) -> None:
-        """Write provenance.json after all input files of the run have been written to the folder."""
+        """Write provenance.json. All input files must already be in the folder."""
         self._write_json("provenance.json", provenance)
         if self._owner:
             names = {entry.name for entry in self.path.iterdir() if not entry.name.startswith(".")}
@@ -349,7 +347,7 @@ class RunFolder:
     # -- resuming --------------------------------------------------------------------------------
 
     def has_checkpoint(self) -> bool:
-        """Return True if the folder has a checkpoint from which the run can be resumed."""
+        """Return True if the run can be resumed from a checkpoint."""
         return (self.path / "checkpoint.npz").exists()
 
     def load_checkpoint(self) -> dict[str, Any]:
@@ -361,7 +359,7 @@ class RunFolder:
         return self._read_checkpoint()[0]
 
     def resume(self, layout: Layout | None = None) -> dict[str, Any]:
-        """Remove rows, frames and log lines written after the last checkpoint; return the saved state.
+        """Remove rows, frames and log lines after the last checkpoint. Return the saved state.
 
         Args:
             layout: new layout of the folder, if the command has added columns since the run began.
@@ -393,7 +391,7 @@ class RunFolder:
         return state
 
     def take(self, layout: Layout) -> None:
-        """Lock a run folder that is resumed from answers.json, so that no other process writes into it.
+        """Lock a run folder that is resumed from answers.json. No other process can then write into it.
 
         Raises:
             FolderError: another process writes the folder, or files that are needed to resume have changed.
@@ -405,7 +403,7 @@ class RunFolder:
             self.check(name)
 
     def restart(self) -> None:
-        """Mark a resumed folder as unfinished, and remove its tables, which are written again at the end.
+        """Mark a resumed folder as unfinished. Remove its tables, which are written again at the end.
 
         Part files that remain because `finalize` was killed are also removed.
         """
@@ -423,7 +421,7 @@ class RunFolder:
     # -- reading ---------------------------------------------------------------------------------
 
     def table(self, name: str, columns: Sequence[str] | None = None, rows: int | None = None) -> pa.Table:
-        """Return a table from disk; for a killed run, only the rows before the last checkpoint.
+        """Return a table from disk. A killed run has only the rows before the last checkpoint.
 
         Args:
             columns: names of the columns to read; None for all.
@@ -432,7 +430,7 @@ class RunFolder:
         return self._reader(name).read(columns, min(self.rows(name), rows or sys.maxsize))
 
     def batches(self, name: str, columns: Sequence[str] | None = None) -> Iterator[pa.Table]:
-        """Yield the rows of a table in batches, for tables that are larger than memory."""
+        """Yield the rows of a table in batches, for tables larger than memory."""
         left = self.rows(name)
         for batch in self._reader(name).batches(columns):
             if left <= 0:
@@ -443,7 +441,7 @@ class RunFolder:
     def read(
         self, name: str, columns: Sequence[str] | None = None, rows: int | None = None
     ) -> dict[str, np.ndarray]:
-        """Return a table as numpy arrays by column name, without columns that this folder does not have."""
+        """Return a table as numpy arrays by column name. Columns that it lacks are omitted."""
         table = self.table(name, columns, rows)
         declared = {} if self._layout is None else self._layout.columns(name)
         gaps = {key: table[key].null_count for key in table.column_names if table[key].null_count}
@@ -463,12 +461,12 @@ class RunFolder:
 
     @property
     def system_file(self) -> Path | None:
-        """File that describes the simulation (a system file or a description of objects); None if missing."""
+        """File that describes the simulation. None if missing."""
         return next((self.path / name for name in _SYSTEM if (self.path / name).exists()), None)
 
     @property
     def system(self) -> dict[str, Any]:
-        """Tables of the system file of the run, or an empty dictionary if there is no system file.
+        """Tables of the system file of the run. Empty if there is no system file.
 
         Raises:
             FolderError: the system file is not valid TOML or JSON.
@@ -478,9 +476,9 @@ class RunFolder:
 
     @cached_property
     def about(self) -> dict[str, Any]:
-        """Metadata of the tables: version, kind, system, digest of the run, and the unit of each quantity.
+        """Metadata of the tables: version, kind, system, digest of the run, and units.
 
-        The metadata do not depend on the time of writing; resumed and uninterrupted runs write equal bytes.
+        The metadata have no time of writing. Resumed and uninterrupted runs write equal bytes.
         """
         made, system = self._read_json("provenance.json"), self.system
         named = system.get("units") or system.get("world")
@@ -516,7 +514,7 @@ class RunFolder:
         return self._read_json("provenance.json")
 
     def damaged(self) -> dict[str, str]:
-        """Return the names of files that changed or are missing, with a description of each problem.
+        """Return the names of changed or missing files, with a description of each problem.
 
         Raises:
             FolderError: the manifest itself is damaged.
@@ -524,7 +522,7 @@ class RunFolder:
         return {name: wrong for name in self._listed() if (wrong := self._wrong(name))}
 
     def check(self, name: str) -> None:
-        """Raise an error if the digest of a file differs from the manifest; unlisted files are not checked.
+        """Raise an error if a file differs from its digest in the manifest. Unlisted files pass.
 
         Raises:
             FolderError: the file is missing, or has changed since it was written.
@@ -567,7 +565,7 @@ class RunFolder:
             raise FolderError(message, remedy=_RESTORE, where=str(self.path)) from error
 
     def check_start(self) -> None:
-        """Raise an error if the input files of a run (system and structure) differ from the manifest.
+        """Raise an error if an input file (system, structure) differs from the manifest.
 
         Raises:
             FolderError: the input was changed, so that a new run would differ from the recorded run.
@@ -579,7 +577,7 @@ class RunFolder:
                 self.check(name)
 
     def noted(self) -> list[str]:
-        """Return a one-line message for each changed file, or for a folder that cannot be checked."""
+        """Return a message for each changed file, or for a folder that cannot be checked."""
         if not (self.path / manifest.NAME).exists():
             return [
                 f"{self.path}: has no {manifest.NAME}, so that nothing in it could be checked for damage."
@@ -589,7 +587,7 @@ class RunFolder:
     # -- inside ----------------------------------------------------------------------------------
 
     def _usable(self) -> list[str]:
-        """Return the names of files in a folder for a new run; raise an error if the folder is in use."""
+        """Return the names of files in a folder for a new run. Raise an error if it is in use."""
         there = self.path.iterdir() if self.path.is_dir() else ()
         present = sorted(entry.name for entry in there if entry.name != _LOCK)
         if present and not _came_to_nothing(self.path, present):
@@ -613,7 +611,7 @@ class RunFolder:
         return TableStream(self.path, name, self._layout, lambda path: self.check(manifest.place(path)[1]))
 
     def _sweep(self, *patterns: str) -> None:
-        """Remove temporary files left behind by a killed process, and files that match given patterns."""
+        """Remove temporary files of a killed process, and files that match given patterns."""
         for pattern in (*patterns, ".*.part", *(f"{name}/.*.part" for name in SUBFOLDERS)):
             for file in self.path.glob(pattern):
                 if not (file.parent.is_symlink() and file.parent != self.path):
@@ -633,7 +631,7 @@ class RunFolder:
         return self._manifest[1]
 
     def _wrong(self, name: str) -> str:
-        """Return how a file differs from the manifest, or "" if the file is intact or is not listed."""
+        """Return how a file differs from the manifest. "" if it does not, or is not listed."""
         allowed = self._listed().get(name)
         if allowed is None:
             return ""
@@ -655,7 +653,7 @@ class RunFolder:
         return self._checked[name][1]
 
     def _list_files(self, finished: bool | None = None) -> None:
-        """Add unlisted files of this folder to the manifest, and update the entries of files that grew."""
+        """Add unlisted files to the manifest. Update the entries of files that grew."""
         listed = self._listed()
         there = [f"structures/{entry.name}" for entry in (self.path / "structures").glob("*.extxyz")]
         there += [entry.name for entry in self.path.iterdir() if entry.name not in self._foreign]
@@ -672,7 +670,7 @@ class RunFolder:
         return {name: stream.rows for name, stream in self._streams.items()}
 
     def _settle(self) -> None:
-        """Wait until the current checkpoint is written; raise the error of the writing thread, if any."""
+        """Wait until the current checkpoint is written. Raise the error of its thread, if any."""
         if self._writing is not None:
             written, self._writing = self._writing, None
             written.result()
@@ -732,7 +730,7 @@ class RunFolder:
 
 @contextmanager
 def restoring(path: Path) -> Iterator[None]:
-    """Convert exceptions that are caused by invalid contents of a file into one-line errors.
+    """Convert exceptions caused by invalid contents of a file into one-line errors.
 
     Raises:
         FolderError: the file has contents that mdnum does not write.
@@ -749,7 +747,7 @@ def restoring(path: Path) -> Iterator[None]:
 
 
 def expect(right: object, seen: str) -> None:
-    """Raise an error if a restored value does not meet a condition; for use inside `restoring`.
+    """Raise an error if a restored value is not as expected. Use it inside `restoring`.
 
     Raises:
         ValueError: the condition is false.
@@ -759,7 +757,7 @@ def expect(right: object, seen: str) -> None:
 
 
 def _came_to_nothing(path: Path, present: Sequence[str]) -> bool:
-    """Return True if a folder contains only files of a run that was stopped before the first result."""
+    """Return True if a folder has only files of a run that stopped before the first result."""
     made = manifest.load(path)
     if made is None or made.finished or (path / "parts").is_symlink():
         return False
@@ -785,7 +783,7 @@ def _refuse_to_overwrite(path: Path, present: Sequence[str]) -> None:
 
 
 def _again(path: Path) -> str:
-    """Return a sentence that tells the user how to continue an unfinished run folder."""
+    """Return a sentence on how to continue an unfinished run."""
     made = manifest.load(path)
     if made is None or made.layout is None:
         return "Run again in a new folder"

@@ -1,4 +1,4 @@
-"""Execution of Python files to which a system file refers, if the user has given explicit permission."""
+"""Execution of Python files that a system file names, with the user's permission."""
 
 from __future__ import annotations
 
@@ -34,12 +34,12 @@ def allow_code(allow: bool = True) -> Iterator[None]:
 
 
 def is_allowed() -> bool:
-    """Return True if Python files to which a system file refers may be executed in this context."""
+    """Return True if the user allows the execution of Python files."""
     return _ALLOWED.get()
 
 
 def parts(place: str, folder: Path, where: str = "potential.function") -> tuple[Path, str]:
-    """Split text such as "mine.py:morse" into the path of the file and the name of the function.
+    """Split text such as "mine.py:morse" into file path and function name.
 
     Raises:
         InputError: the text does not have this form.
@@ -51,7 +51,7 @@ def parts(place: str, folder: Path, where: str = "potential.function") -> tuple[
 
 
 def function(place: str, folder: Path, where: str = "potential.function") -> Callable[..., Any]:
-    """Execute a Python file that is given in a system file or an option, and return the named function.
+    """Execute a Python file and return the named function.
 
     Args:
         place: text such as "mine.py:morse", relative to folder.

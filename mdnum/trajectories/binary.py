@@ -1,14 +1,14 @@
-"""Readers of GROMACS's xtc and trr files that check each frame before it is decoded.
+"""Readers of GROMACS's xtc and trr files. They check each frame before it is decoded.
 
-On damaged data, the library that decodes xtc files divides by zero or writes outside its buffers. The process
-then crashes, and all earlier results are lost. Each frame of a file is checked before it is decoded. The
-compressed stream contains the number of bits of each atom's coordinates. The header, the number of atoms, the
-bit counts and the length can therefore be verified without decoding. File damage that leaves a valid stream
-is not detected. Source of the xtc format: the algorithm of xdr3dfcoord (F. van Hoesel; GROMACS, libxdrfile).
+The library that decodes xtc files may divide by zero or write outside its buffers on damaged data. The
+process then crashes, and all earlier results are lost. Each frame of a file is checked before it is decoded.
+The compressed stream contains the number of bits of each atom's coordinates. The header, the number of atoms,
+the bit counts and the length are verified without decoding. File damage that leaves a valid stream is not
+detected. Source of the xtc format: the algorithm of xdr3dfcoord (F. van Hoesel; GROMACS, libxdrfile).
 
-MDAnalysis's readers of xtc and trr keep an index file next to the trajectory. MDAnalysis writes the index
-through symbolic links, and uses an index file even if it belongs to another trajectory. This module uses no
-index file. Source of the trr format: GROMACS, trrio.
+MDAnalysis's readers of xtc and trr keep an index file next to the trajectory. MDAnalysis may use an index
+file of another trajectory. MDAnalysis may write the index through symbolic links. This module uses no index
+file. Source of the trr format: GROMACS, trrio.
 """
 
 from __future__ import annotations
@@ -49,13 +49,13 @@ _TEN = np.float32(10)
 
 
 def opened(trajectory: Any) -> XdrFile | None:
-    """Open the xtc or trr file of an MDAnalysis trajectory, with frame checks; None for other formats."""
+    """Open the xtc or trr file of an MDAnalysis trajectory. None for other formats."""
     path, kind = file_of(trajectory), {"XTC": XtcFile, "TRR": TrrFile}.get(str(trajectory.format))
     return None if kind is None or path is None else kind(path)
 
 
 class XdrFile:
-    """Reader that returns frames of a GROMACS file by number, and neither reads nor writes an index file.
+    """Reader of the frames of a GROMACS file by number. It uses no index file.
 
     Raises:
         ValueError: the data are invalid or the file ends early (raised by every method).
@@ -72,7 +72,7 @@ class XdrFile:
         self._file.close()
 
     def whole_frames(self) -> int:
-        """Return the number of complete frames before the end of the file or the first damaged header."""
+        """Return the number of complete frames before the end of the file or a damaged header."""
         number = 0
         try:
             while self._starts[number] < self._size:
@@ -83,7 +83,7 @@ class XdrFile:
         return number
 
     def ends_at(self, number: int) -> bool:
-        """Return True if the file ends exactly where the frame with the given number would begin."""
+        """Return True if the file ends where the given frame would begin."""
         return self.start(number) == self._size
 
     def start(self, number: int) -> int:
@@ -102,7 +102,7 @@ class XdrFile:
         self.start(number + 1)
 
     def _stream(self, number: int, look: bool = False) -> None:
-        """Move the file position to the end of a frame; if `look` is true, verify the coordinates first."""
+        """Move the file position to the end of a frame. If `look` is true, verify the coordinates."""
         raise NotImplementedError
 
     def _read(self, count: int) -> bytes:
@@ -140,7 +140,7 @@ class XtcFile(XdrFile):
             self._starts.append(self._file.tell())
 
     def read(self, number: int) -> Any:
-        """Check a frame, and return the frame as decoded by MDAnalysis's library, in nm and ps."""
+        """Check a frame. Return it as decoded by MDAnalysis's library, in nm and ps."""
         self.check(number)
         if self._library is None:
             from MDAnalysis.lib.formats.libmdaxdr import XTCFile
@@ -187,10 +187,10 @@ class XtcFile(XdrFile):
 
 @njit
 def _walk(stream, atoms, whole, small):
-    """Return the number of bits that the coordinates of all atoms occupy, or -8 if the stream is invalid.
+    """Return the number of bits of all coordinates, or -8 if the stream is invalid.
 
-    The full coordinates of an atom occupy `whole` bits. A flag bit follows. If the flag bit is set, the next
-    five bits give two numbers: how many of the next atoms are stored as differences of `small` bits, and the
+    The full coordinates of an atom occupy `whole` bits. A flag bit follows. If the flag is set, five bits
+    follow. The five bits give how many of the next atoms are stored as differences of `small` bits, and the
     change of `small`.
     """
     at, done, run = 0, 0, 0
@@ -224,7 +224,7 @@ def _walk(stream, atoms, whole, small):
 
 
 class TrrFile(XdrFile):
-    """Reader of the frames of a trr file, in float32 or float64 as stored."""
+    """Reader of the frames of a trr file, in float32 or float64."""
 
     @property
     def atoms(self) -> int:
@@ -237,7 +237,7 @@ class TrrFile(XdrFile):
         return 8 * self.head(0)[1]
 
     def head(self, number: int) -> tuple[int, int, list[int]]:
-        """Read a frame header up to the time; return (atoms, bytes per number, sizes of the data blocks)."""
+        """Read a frame header up to the time. Return (atoms, bytes per number, sizes of the data blocks)."""
         self._file.seek(self.start(number))
         magic, _, _, word, *numbers = _TRR.unpack(self._read(_TRR.size))
         sizes, atoms, box = numbers[:10], numbers[10], numbers[_BOX]
@@ -270,7 +270,7 @@ class TrrFile(XdrFile):
 
 
 class XtcTrajectory(Trajectory):
-    """An xtc trajectory in Å and ps, whose integer coordinates are decoded to float32."""
+    """An xtc trajectory in Å and ps. Its integer coordinates are decoded to float32."""
 
     format = "XTC"
     reader = "MDAnalysis"

@@ -1,4 +1,4 @@
-"""Comparison of two frames of the same atoms: displacements, their growth, common shift, and velocities."""
+"""Comparison of two frames of the same atoms: displacements, their growth, and velocities."""
 
 from __future__ import annotations
 
@@ -50,7 +50,7 @@ def displacements(
 
 
 def same_lattice(one: Box, other: Box, tolerance: float) -> bool:
-    """Return True if two boxes generate the same lattice, possibly from different lattice vectors.
+    """Return True if two boxes generate the same lattice. Their lattice vectors may differ.
 
     Components of lattice vectors may differ by up to `tolerance`, in length units.
     """
@@ -95,13 +95,13 @@ def common_shift(one: Frame, other: Frame, atoms: AtomIndices = None) -> Float[n
 
 
 def velocities_of(frame: Frame) -> Frame:
-    """Return a frame with the velocities of the given frame in place of its positions."""
+    """Return a frame with velocities in place of positions."""
     assert frame.velocities is not None
     return Frame(frame.index, frame.time, frame.velocities, Box())
 
 
 def velocities_differ(a: Frame, b: Frame, atoms: AtomIndices, bound: float) -> dict[str, Any] | None:
-    """Describe how the velocities of two frames differ, apart from a velocity common to all atoms.
+    """Describe how the velocities of two frames differ, apart from a common velocity.
 
     Args:
         bound: error bound of the difference of two velocities, in length per time.
@@ -132,10 +132,10 @@ class FreeFlight(NamedTuple):
 
 
 def flight_of(start: Frame, end: Frame, step: float = 0.0) -> FreeFlight | None:
-    """Compare displacements with those predicted from velocities; None if there are no velocities or motion.
+    """Compare displacements with predictions from velocities. None without velocities or motion.
 
-    `moved` is the ratio of measured to predicted displacements: about 1, or less if atoms turn around.
-    `factor`, the ratio by least squares, is about 1 if velocities have the right unit and keep direction.
+    `moved` is the ratio of measured to predicted displacements. It is about 1, or less if atoms turn around.
+    `factor` is the ratio by least squares. It is about 1 for the right unit and constant directions.
     """
     if start.velocities is None or end.velocities is None or not end.time > start.time:
         return None
@@ -159,9 +159,8 @@ def flight_of(start: Frame, end: Frame, step: float = 0.0) -> FreeFlight | None:
 def odd_flight(flights: Sequence[FreeFlight]) -> dict[str, Any] | None:
     """Describe a contradiction between displacements, velocities and times (medians over frames), if any.
 
-    If atoms turn around between two frames, displacements smaller than predicted from velocities are
-    expected. Small displacements contradict the velocities only if the velocities keep their directions and
-    are parallel to the displacements.
+    If atoms turn around between two frames, small displacements are expected. Small displacements contradict
+    the velocities only if velocities keep their directions, parallel to the displacements.
 
     Returns:
         the factor by which displacements are too large (or too small, below 1), and whether it is a lower
@@ -180,7 +179,7 @@ def odd_flight(flights: Sequence[FreeFlight]) -> dict[str, Any] | None:
 
 @dataclass(frozen=True)
 class GrowthLaw:
-    """Fits of an exponential and of a power law to the growing distance between two trajectories."""
+    """Fits of an exponential and of a power law to a growing distance of two trajectories."""
 
     frames: int  # used
     rate: float  # of an exponential, per time
@@ -196,10 +195,10 @@ def growth(
     limit: float,
     began: tuple[float, float],
 ) -> GrowthLaw | None:
-    """Fit an exponential and a power law to the growing distance between two trajectories.
+    """Fit an exponential and a power law to the growing distance of two trajectories.
 
-    A constant error of a force or a velocity makes the distance between two runs grow as a low power of time.
-    Chaos makes the distance grow exponentially. Fits exclude distances that are zero or above `limit`.
+    A constant error of a force or velocity makes the distance grow as a low power of time. Chaos makes the
+    distance grow exponentially. Fits exclude distances that are zero or above `limit`.
 
     Args:
         began: earliest and latest possible time at which the separation began, as the origin of a power law.

@@ -56,7 +56,7 @@ class PairQuestion:
 
 
 def last_step(system: Any, steps: int | None, most: int | None = None) -> int:
-    """Return the last step of a run: `steps`, or by default the system file's last step, at most `most`.
+    """Return the last step of a run. The default is that of the system file, at most `most`.
 
     Raises:
         InputError: steps is below 1.

@@ -1,13 +1,11 @@
-"""The largest number of steps (horizon) for which a gradient can be trusted, and what limits this number.
+"""The largest number of steps (horizon) for which a gradient can be trusted.
 
-A gradient ceases to be trusted in five cases. (1) Another precision gives a different gradient, because
-rounding errors have grown. (2) Half the time step gives a different gradient. (3) A pair of atoms turned
-around so close to its cutoff that another time step could add or remove a flip that changes the gradient. (4)
-A decision was so close to its threshold that rounding determined the decision. (5) Gradients from other
-initial states of the same system scatter by more than their mean. If one of the five cases was not examined,
-the verdict on a gradient is undecided.
+Five limits end the trust in a gradient. (1) Another precision gives a different gradient. (2) Half the time
+step gives a different gradient. (3) A pair turned around close to its cutoff, so another time step could add
+or remove a flip. (4) Rounding determined a decision close to its threshold. (5) Gradients from other initial
+states scatter by more than their mean. If one of the five limits was not examined, the verdict is undecided.
 
-A single run, with its tangents (derivatives in forward mode), gives the gradients for all horizons.
+One run with its tangents (derivatives in forward mode) gives the gradients for all horizons.
 """
 
 from __future__ import annotations
@@ -60,7 +58,7 @@ TRUSTED, LIMITED, UNDECIDED = "trusted", "limited", "undecided"
 
 
 class Shorter(Loss):
-    """A loss evaluated for several runs with the same initial state and different last steps (horizons)."""
+    """A loss of several runs with the same start and different last steps (horizons)."""
 
     name = "shorter"
     inner: Loss = eqx.field(kw_only=True)  # the loss
@@ -92,13 +90,13 @@ class Shorter(Loss):
         return self.of(total, self.table.shape[1] - 1)
 
     def of(self, total: Any, k: int) -> Float[Array, ""]:
-        """Return the loss of the run that ends at the horizon with index k."""
+        """Return the loss at the horizon with index k."""
         frames = int(np.asarray(self.table)[:, k].sum())
         return self.inner.value(jax.tree.map(lambda leaf: leaf[k], total), frames)
 
 
 def shorter(problem: Problem, at: Int[np.ndarray, "points"], per: int = 1) -> Problem:
-    """Return a problem with losses at several horizons, in which `per` short steps replace each time step.
+    """Return a problem with losses at several horizons. `per` short steps replace each time step.
 
     Args:
         at: horizons, rising; the last horizon is the length of the run.
@@ -115,7 +113,7 @@ def shorter(problem: Problem, at: Int[np.ndarray, "points"], per: int = 1) -> Pr
 
 @dataclass(frozen=True)
 class Horizons:
-    """Losses and gradients of runs with the same start and different numbers of steps."""
+    """Losses and gradients of runs with the same start and different lengths."""
 
     at: Int[np.ndarray, "points"]  # horizons, steps
     columns: tuple[ParameterEntry, ...]  # the numbers that are differentiated by
@@ -133,7 +131,7 @@ class Horizons:
 
 
 def spread(problem: Problem, points: int) -> Int[np.ndarray, "points"]:
-    """Return evenly spaced horizons, in steps, up to which the loss uses at least one frame of the run."""
+    """Return evenly spaced horizons (steps) for which the loss uses at least one frame."""
     steps = np.unique(np.round(np.linspace(0, problem.steps, points + 1)).astype(np.int64))[1:]
 
     def looks(h: int) -> bool:
@@ -157,7 +155,7 @@ def horizons(
     watch: Callable[[StretchTangents], None] | None = None,
     progress: Progress | None = None,
 ) -> Horizons:
-    """Compute loss and gradient of runs from the same start with different numbers of steps (horizons).
+    """Compute loss and gradient at several horizons of a run.
 
     Args:
         problem: of a pair potential. names: full names of the parameters; each entry takes one tangent.
@@ -199,7 +197,7 @@ def horizons(
 
 
 def first_difference(a: Horizons, b: Horizons) -> int | None:
-    """Return the first step at which the flips of two runs differ; None if all flips are equal."""
+    """Return the first step at which the flips of two runs differ. None if all are equal."""
     common = min(len(a.flips), len(b.flips))
     differ = np.flatnonzero((a.flips[:common] != b.flips[:common]).any(axis=1))
     k = int(differ[0]) if len(differ) else common
@@ -208,7 +206,7 @@ def first_difference(a: Horizons, b: Horizons) -> int | None:
 
 @dataclass(frozen=True)
 class Limit:
-    """One limit on the number of steps for which a gradient can be trusted, and whether it was reached."""
+    """One limit on the number of steps for which a gradient can be trusted."""
 
     what: str  # ROUNDING, STEP, NEAR, FLIPS, AMBIGUOUS or SCATTER
     # the longest horizon, in steps, at which it did no harm; None where it was not examined
@@ -220,7 +218,7 @@ class Limit:
 
 @dataclass(frozen=True)
 class Judgment:
-    """The trust horizon of derivatives with respect to one parameter or to all parameters, and its limits."""
+    """The trust horizon of the derivatives by one or all parameters, and its limits."""
 
     # "trusted" where every limit was examined and none was met, "limited" where one was met, else "undecided"
     verdict: str
@@ -232,7 +230,7 @@ class Judgment:
 
 @dataclass(frozen=True)
 class Trust(Judgment):
-    """Number of steps for which a gradient can be trusted: one verdict on all parameters, and one on each."""
+    """Number of steps for which a gradient can be trusted, for all parameters and for each."""
 
     by: dict[str, Judgment]  # of each parameter, by full name
     tolerance: float  # relative difference above which two precisions, or two time steps, disagree
@@ -246,11 +244,11 @@ class Trust(Judgment):
 
 
 def shadow_of(simulation: Simulation, seed: int = 0) -> tuple[Simulation, tuple[str, ...]]:
-    """Return a simulation that rounds differently, and the given simulation's formats narrower than float64.
+    """Return a simulation that rounds differently. Also return the formats narrower than float64.
 
     A run in formats narrower than float64 is compared with a float64 run. No hardware format is wider than
-    float64. A float64 run is therefore compared with one whose initial state is shifted by one rounding
-    error. The shift of the state shows how rounding affects the gradient, up to a factor of order one.
+    float64. A float64 run is compared with one whose initial state is shifted by one rounding error. The
+    shift shows the effect of rounding on the gradient, up to a factor of order one.
     """
     if simulation.policy != PrecisionPolicy():
         return simulation.with_policy(), tuple(sorted(set(vars(simulation.policy).values()) - {"float64"}))
@@ -274,7 +272,7 @@ def trust(
     growth: GradientGrowth | None = None,
     progress: Progress | None = None,
 ) -> Trust:
-    """Determine the number of steps (horizon) up to which a gradient can be trusted, and what limits it.
+    """Find the number of steps (horizon) up to which a gradient can be trusted.
 
     Args:
         problem: the loss of a rollout of a pair potential.
@@ -387,7 +385,7 @@ def trust(
 
 
 def grew(growth: GradientGrowth) -> bool:
-    """Return whether a gradient grew so much that gradients from other initial states may differ from it."""
+    """Return whether a gradient grew so much that other initial states may give another one."""
     # over the first horizons all of them grow: velocities turn into lengths, and averages gain frames
     size = growth.table["size"][min(CLOCK_STEPS, len(growth.table["size"]) - 1) :]
     there = size[np.isfinite(size) & (size > 0)]
@@ -396,14 +394,14 @@ def grew(growth: GradientGrowth) -> bool:
 
 
 def no_half_step(simulation: Simulation) -> bool:
-    """Return whether a thermostat would add different noise in a run with half the time step."""
+    """Return whether half the time step would give a thermostat different noise."""
     return simulation.integrator.random is not None
 
 
 def verdict_of(
     limits: Sequence[Limit], steps: int, chaotic: bool, skipped: bool
 ) -> tuple[str, int, str, tuple[str, ...]]:
-    """Return the verdict, its horizon, the limit that was reached first, and the limits not examined."""
+    """Return the verdict, its horizon, the first limit, and the limits not examined."""
     examined = [one for one in limits if one.horizon is not None]
     horizon = min((one.horizon or 0 for one in examined), default=0)
     met = [one.what for one in examined if one.reached and one.horizon == horizon]
@@ -440,7 +438,7 @@ def _missed(
     problem: Problem, own: Horizons, turns: Turns | None, unseen, made: ReversePass, moved, tolerance: float,
     saltation: bool, names: Sequence[str],
 ) -> Limit:  # fmt: skip
-    """Find the last step up to which omitted flips and near misses have negligible effects on a gradient."""
+    """Find the last step up to which omitted flips and near misses hardly affect a gradient."""
     if not np.any(np.asarray(problem.simulation.jumps())):
         return Limit(NEAR, problem.steps, False, "no jump")
     if not saltation:
@@ -475,7 +473,7 @@ def _missed(
 
 
 def _shares(term: Float[np.ndarray, "terms columns"], size: Float[np.ndarray, "columns"]):
-    """Return contributions divided by the derivative, and the cumulative root of the sum of their squares."""
+    """Return contributions relative to the derivative, and their cumulative root of squares."""
     with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
         # a term that is not known weighs
         share = np.where(term == 0, 0.0, np.nan_to_num(np.abs(term) / size, nan=np.inf))
@@ -486,7 +484,7 @@ def _left_out(
     made: ReversePass, moved: Float[np.ndarray, "flips columns"], size: Float[np.ndarray, "columns"],
     tolerance: float,
 ) -> Limit | None:  # fmt: skip
-    """Return a limit of the trust horizon if grazing flips or jumps of the loss contribute too much."""
+    """Return a limit if grazing flips or jumps of the loss contribute too much."""
     tape, met = made.tape, made.crossings[::-1]
     energy, virial, speed, weight, slow = (
         joined(met, name) for name in ("energy", "virial", "speed", "weight", "grazing")
@@ -504,7 +502,7 @@ def _left_out(
 
 
 def relative(a: Horizons, b: Horizons) -> dict[str, Float[np.ndarray, "points"]]:
-    """Return, by parameter and horizon, the difference of two gradients, divided by the larger norm."""
+    """Return the difference of two gradients by parameter and horizon, divided by the larger norm."""
     out = {}
     second = b.by_name()
     for name, first in a.by_name().items():
@@ -515,7 +513,7 @@ def relative(a: Horizons, b: Horizons) -> dict[str, Float[np.ndarray, "points"]]
 
 
 def standard_error(made: Sequence[Horizons]) -> dict[str, Float[np.ndarray, "points"]]:
-    """Return, by parameter and horizon, the standard error of the mean gradient divided by its norm."""
+    """Return the standard error of the mean gradient by parameter and horizon, divided by its norm."""
     out = {}
     for name in made[0].by_name():
         each = np.stack([one.by_name()[name] for one in made])
@@ -528,10 +526,10 @@ def standard_error(made: Sequence[Horizons]) -> dict[str, Float[np.ndarray, "poi
 def last_below(
     at: Int[np.ndarray, "points"], values: dict[str, Float[np.ndarray, "points"]], limit: float
 ) -> tuple[int, bool]:
-    """Return the last horizon before two successive errors exceed a limit, and whether such errors exist.
+    """Return the last horizon before two successive errors above a limit, and whether there are any.
 
-    A single error above the limit is ignored (except at the last horizon), because relative errors are large
-    where a gradient changes sign.
+    A single error is ignored, except at the last horizon: relative errors are large where a gradient changes
+    sign.
     """
     beyond = ~(np.max(np.stack(list(values.values())), axis=0) <= limit)
     lasting = beyond & np.append(beyond[1:], True)
@@ -544,11 +542,10 @@ def last_below(
 def last_agreeing(
     at: Int[np.ndarray, "points"], values: dict[str, Float[np.ndarray, "points"]], limit: float
 ) -> tuple[int, bool]:
-    """Return the longest horizon at which all errors are below a limit, and whether a longer horizon exists.
+    """Return the longest horizon with all errors below a limit, and whether a longer one exists.
 
-    Disagreement of two gradients at shorter horizons is ignored. At longer horizons, the relative error due
-    to the time step may decrease, and a flip may contribute a smaller part. If two gradients agree at one
-    horizon, but not at adjacent horizons, the agreement is regarded as chance.
+    Disagreement of two gradients at shorter horizons is ignored. At longer horizons, the relative error of
+    the time step and of a flip may decrease. Agreement at only one horizon is regarded as chance.
     """
     within = np.max(np.stack(list(values.values())), axis=0) <= limit
     if len(within) > 1:
@@ -558,7 +555,7 @@ def last_agreeing(
 
 
 def ambiguity(problem: Problem) -> Limit:
-    """Find the first decision of the run that is closer to its threshold than its rounding error bound."""
+    """Find the first decision whose distance from its threshold is below its rounding error bound."""
     recorder = PairRecorder(problem.simulation)
     for segment in Engine(problem.simulation, problem.steps).segments():
         close = recorder.doubtful(segment)
