@@ -572,7 +572,11 @@ def test_a_list_that_hangs_does_not_outlive_who_asks_it(mine: Path, by: signal.S
     summary = RunFolder.open("out").summary
     assert summary["status"] == "stopped" and summary["left"] > 100 and not summary["failures"]
     if by != signal.SIGKILL:
-        assert summary["asked"] >= 5 and "continues the test" in summary["verdict"] and "right pairs" in " ".join(out.split())
+        assert (
+            summary["asked"] >= 5
+            and "continues the test" in summary["verdict"]
+            and "right pairs" in " ".join(out.split())
+        )
         assert "5 of " in out and "cube of 2.1 cutoffs" in summary["headline"]
     # of most areas nothing was asked; after a kill, what was saved last counts
     assert f"{summary['asked']} of " in summary["headline"]
