@@ -1,4 +1,4 @@
-"""Time limit of a command. Missing results are reported."""
+"""Time limit of a command. The command reports missing results."""
 
 from __future__ import annotations
 
@@ -84,7 +84,7 @@ def interrupting(deadline: Deadline, grace: float = GRACE) -> Iterator[None]:
 def fewest(
     items: Sequence[T], enough: Callable[[list[T]], bool], spent: Callable[[], bool] = lambda: False
 ) -> list[T]:
-    """Return a subset that satisfies a condition. It is minimal unless time ran out.
+    """Return a subset that satisfies a condition. The subset is minimal unless time ran out.
 
     Args:
         items: items that are sufficient together.

@@ -70,7 +70,7 @@ _PATIENCE = 10_000
 
 
 class FrameError(InputError):
-    """Raised if a frame contains impossible data. `frame` is its number in the file, from 0."""
+    """Raised if a frame contains impossible data. `frame` is the number of the frame in the file, from 0."""
 
     def __init__(self, message: str, *, frame: int, remedy: str | None, where: str | None = None):
         super().__init__(message, remedy=remedy, where=where)
@@ -168,7 +168,7 @@ def check_claim(path: str | Path, atoms: int | None = None) -> None:
 
 
 def whole_text(file: str | Path | BinaryIO, where: str | Path) -> str:
-    """Return the whole text of a UTF-8 file. Raise an error if it exceeds the memory.
+    """Return the whole text of a UTF-8 file. Raise an error if the text exceeds the memory.
 
     Raises:
         InputError: the file is too large. OSError, UnicodeDecodeError: the file cannot be read.

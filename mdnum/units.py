@@ -23,7 +23,7 @@ class Units:
     """Unit labels and conversion factors of a unit system.
 
     Internally, lengths, energies and masses have the units of the system file. The unit of time is length *
-    sqrt(mass / energy). Then, acceleration = force / mass.
+    sqrt(mass / energy). With this unit, acceleration = force / mass.
 
     Attributes:
         time_factor: user time * time_factor = internal time.

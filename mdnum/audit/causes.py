@@ -49,9 +49,9 @@ def cause(code: str) -> Cause:
 def heads(findings: Sequence[tuple[str, str]]) -> list[int]:
     """For each finding, return the index of the finding that explains it, or its own index.
 
-    A finding is listed under its deepest cause that is at least as severe. Without such a cause, it is listed
-    under the first finding with the same code. A common cause of several findings is likely but not proven.
-    Correct the finding that is listed first, and then repeat the audit.
+    A finding is listed under its deepest cause that is at least as severe. A finding without such a cause is
+    listed under the first finding with the same code. A common cause of several findings is likely but not
+    proven. Correct the finding that is listed first, and then repeat the audit.
 
     Args:
         findings: code and severity of each finding, in the order in which the findings were made.

@@ -210,7 +210,7 @@ def _lead(atoms: Atoms, group: np.ndarray) -> int:
 def _targeted(
     atoms: Atoms, thresholds: Sequence[PairThreshold], groups: Sequence[np.ndarray]
 ) -> list[tuple[Route, RouteCrossing]]:
-    """Return a few routes for each threshold. On a route, a near pair crosses it."""
+    """Return a few routes for each threshold. On each route, a near pair crosses the threshold."""
     of_lead = {_lead(atoms, group): group for group in groups}
     symbols = np.array(atoms.get_chemical_symbols())
     ranked: list[tuple[int, Route, RouteCrossing]] = []
@@ -488,7 +488,7 @@ def _order(subject: CalculatorSubject, walk: PairWalk, radius: float, most: int)
 def _permuted(
     subject: CalculatorSubject, walk: PairWalk, radius: float, count: int, aside: bool = False
 ) -> tuple[float, float] | None:
-    """Return the changes of energy and force when atoms are reordered. None if due to rounding.
+    """Return the changes of energy and force when atoms are reordered. None if rounding explains them.
 
     If `aside` is true, the last neighbor is moved until it interacts with no atom.
     """

@@ -125,7 +125,7 @@ class BallProgram:
         return run
 
     def _pinned(self, steps: int) -> BallDecisions | None:
-        """Return imposed decisions as arrays (-1: not imposed). None if none is imposed."""
+        """Return imposed decisions as arrays (-1: not imposed). None if no decision is imposed."""
         if not self.pins:
             return None
         world = self.problem.world
@@ -311,7 +311,7 @@ def _reordered(run: BallRun, order: Int[np.ndarray, "balls"]) -> BallRun:
 
 
 def _apart(one: BallRun, other: BallRun, last: int) -> Float[np.ndarray, "times"]:
-    """Return the largest height difference of two runs at each step, m. Infinite without finite heights."""
+    """Return the largest height difference of two runs at each step, m. Infinity if a run blew up."""
     y = [run.y[: last + 1].astype(np.float64) for run in (one, other)]
     with np.errstate(invalid="ignore"):
         off = np.abs(y[0] - y[1])

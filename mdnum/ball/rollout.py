@@ -77,7 +77,7 @@ class BallRun:
 
     @cached_property
     def first_contact(self) -> Int[np.ndarray, "balls"]:
-        """Step (from 1) at which each ball first touches the floor. -1 if it never does."""
+        """Step (from 1) at which each ball first touches the floor. -1 if a ball never does."""
         touched = self.contact.any(axis=0)
         return np.where(touched, self.contact.argmax(axis=0) + 1, -1)
 

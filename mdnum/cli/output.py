@@ -105,7 +105,7 @@ def print_lines(lines: Iterable[str]) -> None:
 
 
 def console(width: int = _PIPE_WIDTH) -> Console:
-    """Return rich's console for stdout. It escapes control characters."""
+    """Return rich's console for stdout. The console escapes control characters."""
     from rich.console import Console
     from rich.segment import Segment
 
@@ -134,7 +134,7 @@ def print_prose(text: str, indent: int = 2, style: str = "") -> None:
 
 
 def print_table(title: str, columns: Sequence[str], rows: Iterable[Sequence[Any]]) -> None:
-    """Print a table with colored severities. Without column names, it has no header."""
+    """Print a table with colored severities. Without column names, the table has no header."""
     from rich.table import Table
     from rich.text import Text
 

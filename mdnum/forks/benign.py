@@ -8,7 +8,7 @@ changed. At the chosen step, all changes are distinguishable from rounding.
 The test follows those of climate models (Baker et al. 2015; Milroy et al. 2018). Measured quantities
 (features) are standardized and projected onto principal components of the ensemble. A run is an outlier if at
 least two of its components exceed the limit. A program fails the test if at least two of its three runs are
-outliers. In other words, the median of its runs' second-largest components exceeds the limit.
+outliers. In other words, the median of the second-largest component over its runs exceeds the limit.
 """
 
 from __future__ import annotations
@@ -171,7 +171,7 @@ class Window:
 
     @property
     def power(self) -> float:
-        """Smallest score/limit ratio of deliberate changes that must be detected. Infinity if none exist."""
+        """Smallest score/limit ratio of changes that must be detected. Infinity without changes."""
         return min((score for one in self.table if one.must_fail for score in one.scores), default=np.inf)
 
     @property

@@ -67,8 +67,8 @@ def differentiable(
 ) -> Callable[[Values], jax.Array]:
     """Return the loss as a function that JAX can differentiate in reverse mode.
 
-    For other variables, such as a pytree, write a function that computes the named values from them. Then
-    apply `jax.grad` to the composition.
+    For other variables, such as a pytree, write a function that computes the named values from these
+    variables. Apply `jax.grad` to the composition.
 
     Args:
         problem, names, method: as for `value_and_grad`, which also lists errors and warnings.

@@ -416,7 +416,7 @@ def note(before, bits, index, x, v, row, pairs, ends, count):
     The array of previous decisions is overwritten with the present decisions.
 
     Separate passes over blocks of 64 decisions find changes, look up neighbors and store rows. A single pass
-    is slower: it has a mispredicted branch for every change.
+    is slower: every change costs a mispredicted branch.
     """
     words, atoms = bits.shape
     size, flat = words * atoms, index.reshape(-1)

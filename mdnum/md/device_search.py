@@ -36,7 +36,7 @@ class DeviceBuilder:
     def build(
         self, positions: Float[Array | np.ndarray, "atoms 3"], cell: Cell, r_list: float, slots: int
     ) -> tuple[Int[Array, "slots atoms"], Int[Array, "atoms"], int]:
-        """Build a neighbor list as `neighbors.ListBuilder.build` does. Its arrays stay on the device."""
+        """Build a neighbor list like `neighbors.ListBuilder.build`. The arrays stay on the device."""
         x = jnp.asarray(positions, np.float64).T
         extent, low, high = cell.widths.copy(), np.zeros(3), np.ones(3)
         if not all(cell.pbc):

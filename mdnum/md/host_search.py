@@ -181,7 +181,7 @@ def _images_within(x, y, z, xi, yi, zi, matrix, inverse, r2_list, mask):
 
 @njit
 def _compressed(mask, label, first, atoms, out, place):
-    """Write the labels of the marked atoms. Return their number."""
+    """Write the labels of the marked atoms. Return the number of labels."""
     filled = place
     for k in range(0, atoms, EIGHT):
         filled = kept(mask, k, label, first + k, out, filled)
@@ -349,7 +349,7 @@ _using = threading.Lock()
 def _table(room: int, atoms: int) -> Int[np.ndarray, "room atoms"]:
     """Return memory for a table of neighbors that XLA on a CPU uses without a copy.
 
-    The table of a million atoms needs half a gigabyte. Its allocation takes longer than a search.
+    The allocation of a table for a million atoms (half a gigabyte) takes longer than a search.
     """
     size = 4 * room * atoms + 64
     with _using:
@@ -363,5 +363,5 @@ def _table(room: int, atoms: int) -> Int[np.ndarray, "room atoms"]:
 
 
 def free_extent(cell: Cell, low: float, high: float) -> float:
-    """Return the extent of the atoms along a nonperiodic axis. 0 (a single bin) in a tilted box."""
+    """Return the extent of the atoms along a nonperiodic axis. The extent is 0 in a tilted box."""
     return float(high - low) if cell.orthorhombic or not any(cell.pbc) else 0.0

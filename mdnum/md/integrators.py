@@ -212,7 +212,7 @@ class Integrator(eqx.Module):
         return type(self).deform is not Integrator.deform
 
     def check(self, cell: Cell) -> None:
-        """Raise `InputError` for an unsupported box or option. Called once, on the host."""
+        """Raise `InputError` for an unsupported box or option. `check` is called once, on the host."""
 
     def freedom(self, masses: Float[Any, "atoms"]) -> int:
         """Return the number of degrees of freedom: 3 per atom, minus 3 for zero total momentum."""
@@ -337,7 +337,7 @@ class KickDrift(Integrator):
 
 
 def without_kick(integrator: Integrator) -> str | None:
-    """Return why derivatives of kick and drift are invalid. None if they are valid."""
+    """Return why derivatives of kick and drift are invalid. None if the derivatives are valid."""
     if type(integrator) in (VelocityVerlet, Langevin):
         return None
     if isinstance(integrator, KickDrift) and _is_linear(integrator):
@@ -391,7 +391,7 @@ class Langevin(KickDrift):
     """Langevin dynamics, BAOAB (Leimkuhler & Matthews 2013): drift, exact Ornstein-Uhlenbeck step, drift.
 
     The noise depends only on the random key and the step number. Two runs can therefore have the same noise.
-    A resumed run continues its noise.
+    A resumed run continues its noise sequence.
 
     Example:
         >>> cut = mdnum.Cut("switched", 8.5)

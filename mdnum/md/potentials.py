@@ -34,12 +34,12 @@ else:
 
 
 def of_type(leaf: Num[Array, "types"], types: Integer[Array, "..."] | None) -> Num[Array, "..."]:
-    """Return the array entries of given pair types, without bounds checks. None: there is only one type."""
+    """Return the array entries of given pair types, without bounds checks. None means a single type."""
     return leaf[0] if types is None else leaf.at[types].get(mode="promise_in_bounds")
 
 
 class PairPotential(eqx.Module):
-    """Base class of pair potentials without a cutoff. Its fields are the parameters, one entry per pair type.
+    """Base class of pair potentials without a cutoff. The fields are the parameters, by pair type.
 
     Example:
         >>> class Inverse(mdnum.PairPotential):
@@ -75,7 +75,7 @@ class PairPotential(eqx.Module):
         return np.asarray(energy), np.asarray(slope)
 
     def of(self, types: Integer[Array, "..."] | None) -> PairPotential:
-        """Return the potential of given pair types. None for a single type."""
+        """Return the potential of given pair types. `types` is None for a single type."""
         own, shared = self.typed.split()
         return eqx.combine(jax.tree.map(lambda leaf: of_type(leaf, types), own), shared)
 
@@ -85,7 +85,7 @@ class PairPotential(eqx.Module):
         return self
 
     def split(self) -> tuple[Any, Any]:
-        """Return two copies. One has the parameters per pair type, the other the shared parameters."""
+        """Return two copies. The first has the parameters per pair type, the second the shared parameters."""
         return self, jax.tree.map(lambda _: None, self)
 
     @property

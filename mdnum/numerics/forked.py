@@ -13,7 +13,7 @@ _forked = False
 
 
 def check_not_forked() -> None:
-    """Raise an error if this process cannot use jax. Call this before the first use of jax.
+    """Raise an error if this process cannot use jax. Call this function before the first use of jax.
 
     Raises:
         InputError: this process is a fork of a process that has used jax.

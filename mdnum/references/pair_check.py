@@ -66,7 +66,7 @@ class Search:
         return len(read(self._call(pair, cell, pbc, 1.0))) > 1
 
     def refusal(self, positions: ndarray, cell: ndarray, pbc: ndarray, r_cut: float) -> str | None:
-        """Return why the search does not support a structure. None if it does."""
+        """Return why the search does not support a structure. None if the search supports it."""
         if self.listed.version is None:
             return "not installed"
         positions, cell = self._placed(positions, cell, pbc)
@@ -244,8 +244,8 @@ def check_pairs(
     """Compare the pairs of every neighbor search with those of brute force.
 
     Each search is run once per cutoff radius. Brute force uses the comparison (< or <=) of the system file.
-    Near the cutoff, its arithmetic is exact. "differs at the cutoff" means that only decisions near the
-    cutoff differ.
+    Near the cutoff, brute force is exact. "differs at the cutoff" means that only decisions near the cutoff
+    differ.
 
     Args:
         subject: a `Simulation`, or any argument of `mdnum.build`.

@@ -248,7 +248,7 @@ class Conservation:
         kinetic: Float[np.ndarray, "rows"],
         least: float,
     ) -> Conservation | None:
-        """Compute fluctuation and drift of the conserved energy. None for few rows or atoms at rest.
+        """Compute fluctuation and drift of the conserved energy. None for too few rows or atoms at rest.
 
         The fluctuation does not include the linear trend. The first half of the run is omitted: atoms on
         lattice sites lose half of their kinetic energy at the start.

@@ -294,7 +294,7 @@ class TableStream:
             return file.metadata.num_rows
 
     def _replace(self, path: Path, tables: Iterable[pa.Table], schema: pa.Schema) -> None:
-        """Write rows into a file. The manifest lists its digest before the file exists.
+        """Write rows into a file. The manifest lists the digest of the file before the file exists.
 
         Every page of the file has a checksum that readers can verify.
         """
@@ -427,7 +427,7 @@ def as_numpy(column: pa.Array | pa.ChunkedArray) -> np.ndarray:
 
 @contextmanager
 def _parquet(path: Path) -> Iterator[pq.ParquetFile]:
-    """Open a parquet file. The checksum of each page is verified when it is read."""
+    """Open a parquet file. The checksum of each page is verified when the page is read."""
     try:
         with opened(path) as raw, pq.ParquetFile(raw, page_checksum_verification=True) as file:
             head, size = file.metadata, os.fstat(raw.fileno()).st_size

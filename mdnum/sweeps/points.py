@@ -133,7 +133,7 @@ class Workspace:
         return self.place / address
 
     def result(self, address: str) -> dict[str, Any] | None:
-        """Return the stored result of a point. None if it was not computed yet.
+        """Return the stored result of a point. None if the point was not computed yet.
 
         Raises:
             FolderError: the file with the result is damaged.
@@ -168,7 +168,7 @@ class Workspace:
 
     @contextmanager
     def claimed(self, address: str) -> Iterator[bool]:
-        """Context manager: claim a point for this process. Yield whether this succeeded.
+        """Context manager: claim a point for this process. Yield whether the claim succeeded.
 
         After a claim, check again for a result. Another process may have finished the point.
         """
@@ -221,7 +221,7 @@ class Workspace:
 
     @contextmanager
     def filling(self, address: str, point: Mapping[str, Any]) -> Iterator[Path]:
-        """Yield an empty folder. It becomes the point's folder if the `with` block raises no error."""
+        """Yield an empty folder. The folder becomes that of the point if the `with` block raises no error."""
         here = self.place / f".{address}.{socket.gethostname()}.{os.getpid()}"
         shutil.rmtree(here, ignore_errors=True)
         with disk_errors(here):
@@ -246,7 +246,7 @@ class Workspace:
                 os.replace(file, target / file.name)
 
     def swept(self) -> int:
-        """Remove unfinished folders of ended processes. Return their number."""
+        """Remove unfinished folders of ended processes. Return the number of folders."""
         count = 0
         # folders before claims: whoever makes a folder has claimed its point before
         for folder in [one for one in self.place.glob(".*.*.*") if one.is_dir()]:
@@ -272,14 +272,14 @@ def me() -> dict[str, Any]:
 
 @cache
 def boot() -> str:
-    """Return the identifier of this machine's boot. Empty if not available."""
+    """Return the identifier of this machine's boot. Empty if there is no identifier."""
     with suppress(OSError):
         return Path("/proc/sys/kernel/random/boot_id").read_text(encoding="ascii").strip()
     return ""
 
 
 def born(pid: int) -> str | None:
-    """Return the start time of a local process in ticks. None if it does not exist, "" if unknown."""
+    """Return the start time of a local process in ticks. None for no process, "" for an unknown time."""
     try:
         os.kill(pid, 0)
     except ProcessLookupError:

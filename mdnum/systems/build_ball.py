@@ -120,7 +120,7 @@ def start(spec: ball.BallSpec) -> tuple[Float[np.ndarray, "balls"], Float[np.nda
 
 
 def _control(table: ball.Control, h: float, steps: int) -> Float[np.ndarray, "steps"] | None:
-    """Return the acceleration in each time step besides gravity, m/s². None for gravity alone."""
+    """Return the acceleration in each time step besides gravity, m/s². None if only gravity acts."""
     match table:
         case ball.ConstantControl():
             return np.full(steps, table.value)

@@ -28,7 +28,7 @@ ONSET_FRACTION = 0.9
 
 
 def pair_key(a: str, b: str) -> str:
-    """Return the name of a pair of species, such as "Ni-P". Their order has no effect."""
+    """Return the name of a pair of species, such as "Ni-P". The order of the species has no effect."""
     return "-".join(sorted((a, b)))
 
 

@@ -103,7 +103,7 @@ class Trial:
     # --- the programs ---------------------------------------------------------------------------------
 
     def _lists(self) -> None:
-        """Find the list format of the energy function. Initialize its parameters."""
+        """Find the list format of the energy function. Initialize the parameters of the function."""
         model, lists, own = self.model, self.model.lists, None
         if lists is not None:
             for x in (self.x / self.call.length, self.x @ np.linalg.inv(self.cell)):
@@ -130,7 +130,7 @@ class Trial:
             self.model = replace(model, parameters=model.start(key, x, own))
 
     def bare(self, parameters, x, idx, real, cell, box, strain, code):
-        """Call the energy function in its calling convention. The energy is in its unit."""
+        """Call the energy function in its calling convention. The energy is in the unit of the function."""
         call, model = self.call, self.model
         neighbor = jaxmd.as_neighbor_list(idx, real, model.format, model.self_edges, code)
         if call.how.images:
@@ -227,7 +227,7 @@ class Trial:
         return np.where(near, idx, self.n).astype(np.int32)
 
     def distances(self, idx, x) -> Float[np.ndarray, "atoms slots"]:
-        """Return the distances of all pairs in a list. Those of padding are arbitrary."""
+        """Return the distances of all pairs in a list. Distances of padding entries are arbitrary."""
         d = displacement(self.box, x[:, None], x[np.minimum(idx, self.n - 1)])
         return np.sqrt(sum(c * c for c in d))
 

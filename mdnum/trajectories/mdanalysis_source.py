@@ -1,9 +1,9 @@
 """Trajectories read by MDAnalysis, and data that MDAnalysis does not read.
 
-MDAnalysis takes a damaged frame of dcd, trr and some text formats for the end of the file. It skips the
-remaining data silently. The digits of a truncated last number in a text file are read as a different number.
-The Amber NetCDF file of a killed run has fewer records than its header states. MDAnalysis rejects such a
-file; this module reads it (ambermd.org/netcdf/nctraj.xhtml).
+MDAnalysis takes a damaged frame of dcd, trr and some text formats for the end of the file. MDAnalysis skips
+the remaining data silently. The digits of a truncated last number in a text file are read as a different
+number. The Amber NetCDF file of a killed run has fewer records than its header states. MDAnalysis rejects
+such a file; this module reads it (ambermd.org/netcdf/nctraj.xhtml).
 """
 
 from __future__ import annotations
@@ -71,7 +71,7 @@ class LibraryFrames:
         self._guard = opened(trajectory)
 
     def timestep(self, number: int, forward: bool = False) -> Any:
-        """Return MDAnalysis's timestep of a frame. Set `forward` if the reader is at the previous frame.
+        """Return MDAnalysis's timestep of a frame. `forward` means that the reader is at the previous frame.
 
         Raises:
             UnreadableFrame: the frame is unreadable, would crash the process, or ends with a truncated
@@ -243,7 +243,7 @@ def labels_of(trajectory: Any) -> Callable[[int], np.ndarray | None]:
 
 
 def _length_of(trajectory: Any) -> str:
-    """Return the name of the length unit. "" if the file format does not define it (GSD)."""
+    """Return the name of the length unit. "" if the file format defines no unit (GSD)."""
     unit = trajectory.units.get("length")
     if unit is None or getattr(trajectory, "convert_units", True):
         return "Å" if unit else ""
@@ -268,7 +268,7 @@ def _time_factors(trajectory: Any) -> tuple[float, float]:
 
 
 def left_over(trajectory: Any) -> str | None:
-    """Describe data after the last frame of MDAnalysis. None if there are none.
+    """Describe data after the last frame of MDAnalysis. None if there are no data.
 
     In line-based text, the MDAnalysis reader is moved to its last frame.
     """
@@ -320,7 +320,7 @@ def _behind_dcd(path: Path, frames: int) -> tuple[int, int]:
 
 
 def _behind_text(file: Any) -> str | None:
-    """Describe lines after the last frame of a text file, except blank lines. None if there are none."""
+    """Describe lines after the last frame of a text file, except blank lines. None if there are no lines."""
     if file is None or file.closed:
         return None
     lines = 0
@@ -356,7 +356,7 @@ def _text(trajectory: Any) -> tuple[Path, str] | None:
 
 
 class NetcdfFile(netcdf_file):
-    """A classic NetCDF file. Its complete records can be read even with a wrong header."""
+    """A classic NetCDF file. Complete records can be read even if the header is wrong."""
 
     # where the first record begins, bytes
     _begin = sys.maxsize
@@ -374,7 +374,7 @@ class NetcdfFile(netcdf_file):
 
     @property
     def told(self) -> int:
-        """Number of records in the header. -1 if it was never set."""
+        """Number of records in the header. -1 if the number was never set."""
         return int(vars(self)["_recs"])
 
     @property

@@ -4,10 +4,10 @@ A file with three decimals changes every coordinate by up to 0.0005. Rounding ca
 a pair near the cutoff is inside. `infer` finds the decimal grid from the coordinates.
 
 Rounding can move a cutoff crossing to another frame, hide a short contact, or create a crossing. One file
-does not show which flips rounding changes. `grid_effect` estimates their number. Random pairs near the cutoff
-are moved by displacements found in the file. Flips are then counted with and without rounding. In a
-nearest-neighbor rule, a flip exchanges two neighbors at similar distances. For nearest-neighbor rules, random
-triples of atoms are moved.
+does not show which flips rounding changes. `grid_effect` estimates the number of these flips. Random pairs
+near the cutoff are moved by displacements found in the file. Flips are then counted with and without
+rounding. In a nearest-neighbor rule, a flip exchanges two neighbors at similar distances. For
+nearest-neighbor rules, random triples of atoms are moved.
 """
 
 from __future__ import annotations

@@ -52,7 +52,7 @@ def select(trajectory: Trajectory, words: str) -> Int[np.ndarray, "chosen"]:
 
 
 def _universe(trajectory: Trajectory) -> Any:
-    """Return an MDAnalysis Universe at the first requested frame. Its distances are float32."""
+    """Return an MDAnalysis Universe at the first requested frame. Distances in the Universe are float32."""
     from MDAnalysis.lib.mdamath import triclinic_box
 
     first = next(iter(trajectory.frames()), None)

@@ -7,7 +7,7 @@ This module reads three text formats itself, because other libraries lose inform
   Howto_triclinic). MDAnalysis reduces the coordinates to float32 and ignores the tilt of the box.
 - GROMACS's gro files. The distance between decimal points is the column width (manual.gromacs.org, reference
   manual, file formats). MDAnalysis and ASE read only the first gro frame.
-- Extended XYZ, one frame at a time. Otherwise, ASE scans the whole file first.
+- Extended XYZ, one frame at a time. By default, ASE scans the whole file first.
 """
 
 from __future__ import annotations
@@ -184,7 +184,7 @@ def _is_cut(word: str, others: Sequence[str]) -> bool:
 
 
 def _digits(word: str) -> tuple[int, int, int] | None:
-    """Count the decimals, significant digits and exponent digits (-1: none) of a number. None for a word."""
+    """Count decimals, significant digits and exponent digits (-1: none) of a number. None for other text."""
     match = _NUMBER.fullmatch(word)
     if match is None:
         return None
@@ -368,7 +368,7 @@ class LammpsDump(TextTrajectory):
 
 
 def _labels(columns: list[str], rows: np.ndarray) -> np.ndarray | None:
-    """Return the elements of the atoms, or their types. None if both are missing."""
+    """Return the elements of the atoms, or their types. None if elements and types are missing."""
     name = next((one for one in ("element", "type") if one in columns), None)
     return None if name is None else rows[:, columns.index(name)].astype(str)
 
@@ -402,7 +402,7 @@ def _atoms(items: dict[str, list[str]]) -> tuple[list[str], np.ndarray]:
 
 
 def _bounds(items: dict[str, list[str]]) -> Box:
-    """Return the box of a dump frame. Its origin is a corner of the box."""
+    """Return the box of a dump frame. The origin of the box is a corner."""
     head, *rows = items["BOX BOUNDS"]
     names, words = head.split(), [row.split() for row in rows[:3]]
     pbc, values = np.array([name == "pp" for name in names[-3:]], bool), np.array(words, np.float64)
@@ -481,7 +481,7 @@ class GroTrajectory(TextTrajectory):
 
 
 def _fixed_columns(rows: list[str], width: int, count: int) -> Float[np.ndarray, "atoms numbers"]:
-    """Return the numbers in columns of fixed width. They need no spaces between them."""
+    """Return the numbers in columns of fixed width. Spaces between columns are not needed."""
     size = _HEAD + count * width
     text = np.array([row[:size].ljust(size).encode() for row in rows], dtype=f"S{size}")
     letters = np.frombuffer(text.tobytes(), "S1").reshape(len(rows), size)[:, _HEAD:]
@@ -500,5 +500,5 @@ def _gro_box(line: str) -> Box:
 
 
 def _box_words(line: str) -> list[str]:
-    """Split a box line into numbers with five decimals. Spaces between them may be missing."""
+    """Split a box line into numbers with five decimals. Spaces between numbers may be missing."""
     return _TOUCHING.findall(line) if max(map(len, line.split())) > _LONG else line.split()

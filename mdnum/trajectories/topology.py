@@ -1,10 +1,10 @@
 """Atoms and boxes from MDAnalysis and ASE.
 
-MDAnalysis stores three lengths and three angles of a box. It assumes that the first vector is along x and the
-second in the xy plane. For boxes in other orientations, the periodic images from MDAnalysis are silently
-wrong:
+MDAnalysis stores three lengths and three angles of a box. MDAnalysis assumes that the first vector is along x
+and the second in the xy plane. For boxes in other orientations, the periodic images from MDAnalysis are
+silently wrong:
 
-- CHARMM (since version 22) writes symmetric box matrices to dcd files. They have no orientation.
+- CHARMM (since version 22) writes symmetric box matrices to dcd files, without an orientation.
 - MDAnalysis takes the tilt factors of HOOMD's boxes for cosines of angles (gsd files).
 - Boxes in H5MD and DL_POLY HISTORY files may have vectors in any direction.
 
@@ -205,7 +205,7 @@ def topology_universe(topology: str | Path) -> Any:
 
 
 def atoms_in(path: str | Path, topology: int | None = None, format: str | None = None) -> int | None:
-    """Return the number of atoms in a trajectory. None if it is not known."""
+    """Return the number of atoms in a trajectory. None if the number is not known."""
     from MDAnalysis.core._get_readers import get_reader_for
 
     for known in ({}, {"n_atoms": topology}):
@@ -227,7 +227,7 @@ def formats_of(trajectory: Any) -> list[str]:
 
 
 def file_of(trajectory: Any) -> Path | None:
-    """Return the path of the file of an MDAnalysis reader. None without a single file."""
+    """Return the path of the file of an MDAnalysis reader. None if there is no single file."""
     path = getattr(trajectory, "filename", None)
     return Path(path) if isinstance(path, str | Path) else None
 

@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, repr=False)
 class Outcome:
-    """Summary and verdict of a command. Methods read its tables and figures.
+    """Summary and verdict of a command. Methods read the tables and figures.
 
     An outcome can be pickled and returned by worker processes. Do not move the output folder: tables and
     figures are read on first use.
@@ -68,7 +68,7 @@ class Outcome:
         return cast(Page, self._page)
 
     def table(self, name: str) -> pa.Table:
-        """Return a table of the output folder. `.to_pandas()` converts it to a data frame.
+        """Return a table of the output folder. `.to_pandas()` converts the table to a data frame.
 
         Raises:
             FolderError: no table has this name (the message lists all tables), or the table is damaged.
@@ -86,7 +86,7 @@ class Outcome:
             return folder.table(name)
 
     def plot(self, name: str) -> Axes:
-        """Draw a figure of the page as a new pyplot figure. `name` is the name of its file in figures/.
+        """Draw a figure of the page as a new pyplot figure. `name` is the name of a file in figures/.
 
         Returns:
             the matplotlib axes, or the first axes if there are several; `.figure.axes` lists all axes.

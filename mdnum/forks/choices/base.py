@@ -29,13 +29,13 @@ _SIGNED = ("ulps", "more")
 
 
 class Choice:
-    """One numerical choice, such as the precision. Its arguments are the fields of a frozen dataclass.
+    """One numerical choice, such as the precision. The fields of a choice are its arguments.
 
     To add a choice, decorate a subclass with `choice("family")`. The family is the word before "=" in the
-    choice's text. A choice in another package sets its own `family` and is decorated with `choice(None)`. It
-    is an entry point of the group "mdnum.choices". The fields of a choice are written after "=", separated by
-    ":". A field `both` is written after "@". The first line of the class docstring describes the choice for
-    users.
+    choice's text. A choice in another package sets its own `family` and is decorated with `choice(None)`. The
+    choice is an entry point of the group "mdnum.choices". The fields of a choice are written after "=",
+    separated by ":". A field `both` is written after "@". The first line of the class docstring describes the
+    choice for users.
     """
 
     family: ClassVar[str] = ""  # the word before "="
@@ -104,7 +104,7 @@ CHOICES: Registry[Any] = Registry("choice", "mdnum.choices", Choice)
 
 @dataclass_transform(frozen_default=True)
 def choice(family: str | None):
-    """Make a subclass of `Choice` a frozen dataclass. Register it if a family is given."""
+    """Make a subclass of `Choice` a frozen dataclass. Register the subclass if a family is given."""
 
     def add(cls: type[Any]) -> type[Any]:
         made = dataclass(frozen=True)(cls)
@@ -128,7 +128,7 @@ def shipped(world: str) -> dict[str, Choice]:
 
 
 def unavailable(choice: Choice, system: Simulation | System | BallSystem) -> str | None:
-    """Return why a choice does not apply to a system. None if it applies."""
+    """Return why a choice does not apply to a system. None if the choice applies."""
     made = twin_or_reason(choice, system)
     return made if isinstance(made, str) else None
 

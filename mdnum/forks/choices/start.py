@@ -94,8 +94,8 @@ class Relabel(Summed):
 class Rotate(Summed):
     """The axes of the box exchanged or reversed.
 
-    An exchange of axes is exact. It changes the order of the sum of a squared distance. A change of sign
-    rounds positions once more, when they are wrapped into the box.
+    An exchange of axes is exact. The exchange changes the order of the sum of a squared distance. A change of
+    sign rounds positions once more, when positions are wrapped into the box.
     """
 
     screened = "rotate rotate@exact"

@@ -71,12 +71,12 @@ class PolicyHorizon:
 
     @property
     def horizon(self) -> int | None:
-        """First step with a decision that differs from the exact one. None if all agree."""
+        """First step with a decision that differs from the exact one. None if all decisions agree."""
         return None if self.decision is None else self.decision.step
 
     @property
     def margin(self) -> float:
-        """Margin of the first wrong decision, in the exact run. NaN if none is wrong."""
+        """Margin of the first wrong decision, in the exact run. NaN if no decision is wrong."""
         return float("nan") if self.decision is None else self.decision.margins["A"]
 
     def is_all(self, dtype: str) -> bool:
@@ -106,7 +106,7 @@ def certify(
     """Compute the exact history, and the step at which each precision leaves it.
 
     The numbers of the system file are rounded to float64. A run in lower precision rounds the numbers of the
-    file again. Its deviation includes this rounding.
+    file again. The deviation of the run includes this rounding.
 
     Args:
         system: a Lennard-Jones system of at most 108 atoms at constant energy (NVE), or a ball whose time
@@ -256,7 +256,7 @@ def _with_gains(rows: list[PolicyHorizon], last: int) -> list[PolicyHorizon]:
 def _closer(base: PolicyHorizon, row: PolicyHorizon) -> float:
     """Return how many more bits of the exact positions one run has than another.
 
-    The number is the median over the second half of the steps before the first wrong decision. This median
+    The number is the median over the second half of the steps before the first wrong decision. The median
     does not depend on which pair approaches its cutoff.
     """
     if base.separation is None or row.separation is None:

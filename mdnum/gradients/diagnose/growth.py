@@ -301,7 +301,7 @@ class Jacobian:
         self.coordinates = 6 * tape.simulation.atoms
 
     def image(self, block: Float[np.ndarray, "coordinates vectors"], backward: bool = False) -> TangentImage:
-        """Return the Jacobian times vectors. If `backward`, its transpose times vectors."""
+        """Return the Jacobian times vectors. If `backward`, return the transpose times vectors."""
         stretches = self.tape.backward() if backward else self.tape.forward()
         vectors, steps = block.shape[1], self.tape.steps
         mixing, log_scale = np.eye(vectors), 0.0

@@ -3,7 +3,7 @@
 A pair that turns back just outside its cutoff causes no flip. If the pair came slightly closer, it would
 cross the cutoff twice at a low radial speed. A crossing contributes to the gradient in proportion to 1 /
 radial speed. A pair that turns back just inside the cutoff has two crossings. A small perturbation can remove
-them. Therefore, all turning points near the cutoff are examined, also those between two steps.
+both crossings. Therefore, all turning points near the cutoff are examined, also those between two steps.
 
 Near the turning point the distance is r(t) = r_m + a (t - t_m)² / 2. A pair that passes the cutoff by a depth
 d crosses the cutoff at speed sqrt(2 a d). Two crossings contribute 2 w / sqrt(2 a d), where w is the

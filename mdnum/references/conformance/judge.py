@@ -136,7 +136,7 @@ class Failure:
 
     @property
     def kind(self) -> tuple[str, str]:
-        """Error code and exception message. They stay the same in a reduced test case."""
+        """Error code and exception message. Both stay the same in a reduced test case."""
         text = self.text if self.code in ("RAISED", "CRASHED", "MALFORMED") else ""
         return self.code, without_numbers(text)
 
@@ -309,7 +309,7 @@ def _measures(answer: ListAnswer, truth: Truth, how: Conventions) -> list[Failur
 
 
 def shown_error(answer: ListAnswer, truth: Truth, how: Conventions) -> tuple[float, float] | None:
-    """Return the rounding error of the pairs. None if they are wrong even for float32."""
+    """Return the rounding error of the pairs. None if pairs are wrong even for float32."""
     units = 2.0 ** np.arange(-52, -23)
     unit = next((unit for unit in units if not judge(answer, truth, replace(how, unit=unit))), None)
     return None if unit is None else (float(unit * truth.scale), float(unit / DOUBLE))
