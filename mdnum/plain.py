@@ -68,7 +68,7 @@ def plain(value: Any) -> Any:
 
 @dataclass_transform(frozen_default=True)
 def result(kind: type[T]) -> type[T]:
-    """Make a class a frozen dataclass. Its repr shows numbers, short texts and types."""
+    """Make a class a frozen dataclass. The repr shows numbers, short texts and types."""
 
     def __repr__(self: Any) -> str:
         values = ((one.name, getattr(self, one.name)) for one in dataclasses.fields(self))

@@ -85,7 +85,7 @@ def _labeled(atoms: Atoms, origin: str) -> Atoms:
 
 
 class _Builder:
-    """Builds a test structure for a calculator. It keeps the best structure so far."""
+    """Builds a test structure for a calculator. Keeps the best structure so far."""
 
     def __init__(self, loaded: LoadedCalculator, meter: Meter):
         self.name, self.calculator, self.meter = loaded.name, loaded.make(), meter
@@ -266,7 +266,7 @@ def _processor_time(subject: CalculatorSubject, atoms: Atoms) -> float:
 
 
 def _felt(subject: CalculatorSubject, pair: Pair) -> tuple[float | None, float | None]:
-    """Estimate the cutoff and the distance of lowest energy of a pair. Each may be None.
+    """Estimate the cutoff and the distance of lowest energy of a pair. Both may be None.
 
     If the calculator fails on atoms without neighbors, it begins to fail at the cutoff.
     """

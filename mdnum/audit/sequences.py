@@ -131,7 +131,7 @@ def _scaled(atoms: Atoms, factor: float) -> Atoms:
 
 
 def approaches(pair: Pair, radius: float) -> Iterator[tuple[str, list[SequenceStep]]]:
-    """Yield sequences in which two atoms come within the cutoff. Each needs a new calculator object.
+    """Yield sequences in which two atoms come within the cutoff. Each sequence needs a new calculator object.
 
     Args:
         radius: cutoff distance, beyond which the particles do not interact, Å.

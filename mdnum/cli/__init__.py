@@ -1,7 +1,7 @@
 """Command line of mdnum: arguments, commands and printing.
 
-This package does not import jax. The exit code is 0 without findings, 1 with findings and 2 for invalid
-input. It is 3 if the time limit ended the command.
+The command line does not import jax. The exit code is 0 without findings, 1 with findings and 2 for invalid
+input. The exit code is 3 if the time limit ended the command.
 """
 
 from __future__ import annotations
@@ -143,7 +143,7 @@ _EXPECTED = {"int_parsing": "a whole number", "int_from_float": "a whole number"
 
 
 def _said(error: Any) -> str:
-    """Return the message of a usage error. It quotes the text if a number was expected."""
+    """Return the message of a usage error. If a number was expected, quote the text."""
     details = getattr(error.__cause__, "errors", None)
     if details is None or details()[0]["type"] not in _EXPECTED:
         return error.format_message()

@@ -1,7 +1,7 @@
 """Separate processes that run one system in several differently compiled programs.
 
-Programs of one system may be compiled, batched or differentiated. They compute the same formulas but may
-round differently. Each variant of a program runs in its own process, because XLA flags apply to a whole
+Programs of one system may be compiled, batched or differentiated. All programs compute the same formulas but
+may round differently. Each variant of a program runs in its own process, because XLA flags apply to a whole
 process. Variants with equal hashes of positions at every step are numerically the same program. If hashes
 differ, the groups of variants with equal hashes indicate the cause.
 
@@ -130,7 +130,7 @@ def variants(
 ) -> Variants:
     """Run a system in several variants of its program. Find which results agree.
 
-    All variants use one neighbor list. Its skin is doubled if the box is large enough. Variants stop before
+    All variants use one neighbor list. The skin is doubled if the box is large enough. Variants stop before
     an atom moves half the skin. Groups may differ between machines: some processors lack fused multiply-add.
 
     Args:

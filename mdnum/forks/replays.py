@@ -331,7 +331,7 @@ def _required(keys: list[int], search: _Search, until: int) -> list[int]:
     """Find a sufficient set of pairs by bisection, one necessary pair after another (QuickXplain).
 
     QuickXplain needs about log2(n) runs per necessary pair of n. Delta debugging needs about n² runs. The
-    search assumes that imposing more decisions never splits runs. It stops after `until` runs.
+    search assumes that imposing more decisions never splits runs. The search stops after `until` runs.
 
     Source: U. Junker, QuickXplain, AAAI 2004.
     """

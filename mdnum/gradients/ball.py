@@ -4,7 +4,7 @@ The methods differentiate the executed operations (unrolled), the program with f
 the loss averaged over random parameters (randomized). Methods that replace the contact by another model are
 in `ball_contacts`.
 
-JAX returns a derivative of 0.0 if the run did not use a parameter. It also returns 0.0 if the derivative
+JAX returns a derivative of 0.0 if the run did not use a parameter. JAX also returns 0.0 if the derivative
 underflowed or was clamped. The function `dependence` distinguishes the two cases.
 """
 
@@ -119,8 +119,8 @@ def dependence(
 ) -> dict[str, Dependence]:
     """Determine which parameters affect a scalar loss, in the branches that ran.
 
-    A parameter is tested by setting its tangent to NaN. NaN tangents propagate through every operation with a
-    derivative, even a zero one. They do not propagate through other operations.
+    A parameter is tested by setting its tangent to NaN. A NaN tangent propagates through every operation with
+    a derivative, even if the derivative is zero. Other operations stop a NaN tangent.
 
     Args:
         function: maps a dictionary of parameters, and the rest, to a scalar loss; compiled once, as long as
@@ -198,7 +198,7 @@ def _plain(program: ClosedJaxpr) -> ClosedJaxpr:
 
 
 class _Rollout(eqx.Module):
-    """The loss after a given number of steps. It is compiled once for equal problems."""
+    """The loss after a given number of steps. Equal problems are compiled only once."""
 
     steps: int = eqx.field(static=True)
     loss: BallLoss

@@ -1,8 +1,9 @@
-"""Losses of a trajectory. They are evaluated frame by frame, so no trajectory is stored.
+"""Losses of a trajectory. Frames are evaluated one by one, so no trajectory is stored.
 
-A loss computes observations from each frame and sums them over frames. Its value is a function of these sums.
-Examples of losses are averages, correlations with the start, and histograms. The derivatives of a loss also
-require only one frame at a time. Each loss of the command line is a class with a name, a label and a unit.
+A loss computes observations from each frame and sums them over frames. The value of the loss is a function of
+the sums. Examples of losses are averages, correlations with the start, and histograms. The derivatives of a
+loss also require only one frame at a time. Each loss of the command line is a class with a name, a label and
+a unit.
 """
 
 from __future__ import annotations

@@ -268,8 +268,8 @@ class RunTape:
 class ReversibleTape(RunTape):
     """A completed run in fixed-point numbers, which is reversed instead of stored.
 
-    The method `backward` reverses the steps with new neighbor lists. It raises NumericalError if a state
-    differs from the forward run.
+    The method `backward` reverses the steps with new neighbor lists. `backward` raises NumericalError if a
+    state differs from the forward run.
 
     Attributes:
         baths: bits that a thermostat's friction discarded, by step; only this memory grows with the run.
@@ -300,7 +300,7 @@ class ReversibleTape(RunTape):
 
     @property
     def nbytes(self) -> int:
-        """Memory (bytes) of bits that friction discarded. It grows with each step."""
+        """Memory (bytes) of bits that friction discarded. The memory grows with each step."""
         return sum(bath.nbytes for bath in self.baths.values())
 
     def forward(self) -> Iterator[TapeStretch]:
@@ -412,7 +412,7 @@ def no_sums(loss: Loss, origin: LossFrame, around: LossContext) -> Any:
 
 
 def frame_of_start(start: Start, simulation: Simulation) -> LossFrame:
-    """Return the frame of step 0. Its energies are NaN, because they are not yet known."""
+    """Return the frame of step 0. Energies are NaN, because they are not yet known."""
     state = start.state
     matrix = jnp.asarray(np.asarray(simulation.cell.matrix), jnp.float64)
     whole = state.x + (matrix.T @ state.images.astype(matrix.dtype)).astype(state.x.dtype)

@@ -24,7 +24,7 @@ from mdnum.numerics.rounding import Reach
 
 
 class Cell(eqx.Module):
-    """A parallelepiped simulation box. Its arrays are numpy's on the host or jax's in jit."""
+    """A parallelepiped simulation box, with numpy arrays on the host and jax arrays in jit."""
 
     # lattice vectors as rows, length, shape (3, 3); a free axis may hold a zero vector
     matrix: Float[np.ndarray | jax.Array, "3 3"]
@@ -211,7 +211,7 @@ def _subtract(lattice, x, y, z, n):
 
 @njit(inline="always")
 def nearest_image(lattice, x, y, z):
-    """Return the minimum image in compiled code. It equals `Cell.minimum_image` bit for bit.
+    """Return the minimum image in compiled code. The bits are those of `Cell.minimum_image`.
 
     Args:
         lattice: the box as returned by `box_of`, in the dtype of the displacement.
@@ -275,7 +275,7 @@ class HostCell:
 def wrap_positions(
     cell: Cell, positions: Float[np.ndarray, "atoms 3"]
 ) -> tuple[Float[np.ndarray, "atoms 3"], Int[np.ndarray, "atoms 3"]]:
-    """Wrap positions. Also return the numbers of lattice vectors subtracted.
+    """Wrap positions. Return them and the numbers of lattice vectors subtracted.
 
     Error: the first pass subtracts the product n * L, which is rounded. A second pass wraps positions that
     rounding left outside the box. A wrapped coordinate may equal the edge length L, if L is added to a tiny

@@ -4,7 +4,7 @@ All units are powers of two. Integer multiples of a unit are therefore exact dou
 depend on the order of summation. Squared distances in pair decisions have no rounding error. A step that adds
 an integer is reversed by subtracting this integer.
 
-A pair force is computed in float64 from the exact distance. Its operations round equally with every compiler.
+A pair force is computed in float64 from the exact distance. The operations round equally with every compiler.
 The force is then rounded to its unit. The forces on both atoms are exactly opposite. The total momentum is
 therefore constant. Forces do not depend on atom labels or on the neighbor list.
 """
@@ -186,7 +186,7 @@ class FixedPointDecider(PairDecider):
 
     @property
     def thresholds(self) -> tuple[Threshold, ...]:
-        """Thresholds of r² by pair type, as doubles. They are half a unit below `limits`."""
+        """Thresholds of r² by pair type, as doubles. Thresholds are half a unit below `limits`."""
         unit = self.spacing * self.spacing
         return tuple(Threshold((limit - 0.5) * unit, "<", "r2") for limit in self.limits)
 
@@ -206,11 +206,11 @@ class FixedPointDecider(PairDecider):
         return whole[0] * whole[0] + whole[1] * whole[1] + whole[2] * whole[2]
 
     def host_quantity(self, dx, dy, dz) -> Float[np.ndarray, "..."]:
-        """Return squared distances on the host (length²). They are rounded only once."""
+        """Return squared distances on the host (length²). Each is rounded only once."""
         return self.host_squares(dx, dy, dz).astype(np.float64) * (self.spacing * self.spacing)
 
     def host_margin(self, displacement, kind) -> Float[np.ndarray, "..."]:
-        """Return margins of squared distances on the host. They are exact except for one rounding."""
+        """Return margins of squared distances on the host. Each is rounded only once."""
         left = np.asarray(self.limits, np.int64)[kind] - self.host_squares(*displacement)
         return (left - 0.5) * (self.spacing * self.spacing)
 

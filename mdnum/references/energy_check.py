@@ -131,9 +131,9 @@ def check_energy(
         judge: reference to use instead of the one chosen by `ase_models.reference`.
         lammps: also evaluate a user's pair function with LAMMPS, if installed; the results must agree.
 
-    For a pair potential with more than `SAMPLED` atoms, the energies and forces of only a few hundred atoms
-    are compared, in clusters at random positions (`neighborhoods`); for these atoms the comparison is exact.
-    Each frame has different random positions, so that two frames cover twice as many atoms.
+    For a pair potential with more than `SAMPLED` atoms, only a few hundred atoms are compared. These atoms
+    are in clusters at random positions (`neighborhoods`). Each frame has different random positions, so that
+    two frames cover twice as many atoms.
 
     Raises:
         InputError: the system cannot be built.
@@ -463,7 +463,7 @@ PLACES, ATOMS = 8, 32  # places at random, and atoms nearest to each whose energ
 def neighborhoods(
     atoms: Atoms, reach: float, *, places: int = PLACES, count: int = ATOMS, seed: int = 0
 ) -> Iterator[tuple[Atoms, Int[ndarray, "chosen"]]]:
-    """Yield clusters of the structure. Each has a group of atoms and all atoms within `reach`.
+    """Yield clusters of the structure. A cluster is a group with all atoms within `reach`.
 
     For a pair potential with range `reach`, the group has the same energies and forces as in the whole
     system. Neighbors are found from distances between atoms and images, without mdnum's cell lists.

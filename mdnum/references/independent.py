@@ -3,9 +3,9 @@
 The numpy code is independent of the code used in a run. Each class of cutoffs has a method `reference` in
 numpy. This code is the only reference if ASE has no class for a potential or a cutoff.
 
-A model takes directed edges (i -> j, displacement d). It returns the energy of each atom and the gradient of
-the total energy with respect to every d. Forces and stress follow from this gradient g: F_i += g, F_j -= g,
-stress = sum(g outer d) / volume.
+A model takes directed edges (i -> j, displacement d). A model returns the energy of each atom and the
+gradient of the total energy with respect to every d. Forces and stress follow from this gradient g: F_i += g,
+F_j -= g, stress = sum(g outer d) / volume.
 """
 
 from __future__ import annotations
@@ -260,7 +260,7 @@ def _triplets(edges: Edges) -> tuple[ndarray, ndarray]:
 
 
 def _cosines(edges: Edges, e: ndarray, f: ndarray) -> tuple[ndarray, ndarray, ndarray]:
-    """Return cosines of the angles between edges e and f. Also return their gradients by d_e and d_f."""
+    """Return cosines of the angles between edges e and f. Also return the gradients by d_e and d_f."""
     re, rf = edges.r[e], edges.r[f]
     ne, nf = edges.d[e] / re[:, None], edges.d[f] / rf[:, None]
     cosine = np.einsum("ta,ta->t", ne, nf)

@@ -1,4 +1,4 @@
-"""Tables that can be sorted, searched and paged in the browser. They are readable without a script."""
+"""Tables that can be sorted, searched and paged in the browser. The tables are readable without a script."""
 
 from __future__ import annotations
 

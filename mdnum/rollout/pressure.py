@@ -28,8 +28,8 @@ class PressureParts:
     """Components of the pressure: kinetic, virial (total and per term) and impulsive.
 
     The impulsive component is due to the energy jump at a cutoff. For one type of pair it is 2/3 π ρ²
-    g(r_cut) r_cut³ u(r_cut) (Trokhymchuk and Alejandre, J. Chem. Phys. 111, 8510, 1999). It is part
-    of the pressure of the truncated potential, but forces and barostats do not include it.
+    g(r_cut) r_cut³ u(r_cut) (Trokhymchuk and Alejandre, J. Chem. Phys. 111, 8510, 1999). The truncated
+    potential has this component, but forces and barostats omit the component.
 
     Args:
         samples: for each sampled step, the volume, length³, and the components, energy/length³.

@@ -96,7 +96,7 @@ def refuse_link(path: Path, in_place: bool = False) -> None:
 
 
 def subfolder(root: Path, name: str) -> Path:
-    """Return a subfolder of a run folder. It is created if missing.
+    """Return a subfolder of a run folder. Create the subfolder if missing.
 
     Raises:
         FolderError: the subfolder is a link, or cannot be created.
@@ -300,7 +300,7 @@ def place(path: Path) -> tuple[Path, str]:
 
 
 def foretell(path: Path, new: str) -> None:
-    """Add the digest of a file's new contents to the manifest. Its present digest stays."""
+    """Add the digest of a file's new contents to the manifest. The present digest stays."""
     root, name = place(path)
     if name == NAME or not (root / NAME).exists():
         return

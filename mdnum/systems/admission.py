@@ -115,7 +115,7 @@ def _resolve(trial: Trial) -> None:
 
 
 def _keep(trial: Trial, box: str) -> None:
-    """Store which keywords the energy function needs. Its energies must be finite."""
+    """Store which keywords the energy function needs. Raise an error if energies are not finite."""
     how = trial.call.how
     trial.learn(box=box)
     energy, forces = trial.there()

@@ -131,7 +131,7 @@ class Evaluator:
         return here, wrapped, table, tables, jax.device_put(x)
 
     def _list(self, here: Simulation, wrapped) -> tuple[PairTable, Tables]:
-        """Return the neighbor list. It is rebuilt if pairs could be missing."""
+        """Return the neighbor list. Rebuild the list if pairs could be missing."""
         if self._kept is not None:
             table, tables, reference, reference_cell = self._kept
             if self._verlet.consumed(wrapped, here.cell, reference, reference_cell) <= 1.0:

@@ -1,10 +1,10 @@
-"""Readers of GROMACS's xtc and trr files. They check each frame before it is decoded.
+"""Readers of GROMACS's xtc and trr files. Each frame is checked before it is decoded.
 
 The library that decodes xtc files may divide by zero or write outside its buffers on damaged data. The
-process then crashes, and all earlier results are lost. Each frame of a file is checked before it is decoded.
-The compressed stream contains the number of bits of each atom's coordinates. The header, the number of atoms,
-the bit counts and the length are verified without decoding. File damage that leaves a valid stream is not
-detected. Source of the xtc format: the algorithm of xdr3dfcoord (F. van Hoesel; GROMACS, libxdrfile).
+process then crashes, and all earlier results are lost. The compressed stream contains the number of bits of
+each atom's coordinates. The header, the number of atoms, the bit counts and the length are verified without
+decoding. File damage that leaves a valid stream is not detected. Source of the xtc format: the algorithm of
+xdr3dfcoord (F. van Hoesel; GROMACS, libxdrfile).
 
 MDAnalysis's readers of xtc and trr keep an index file next to the trajectory. MDAnalysis may use an index
 file of another trajectory. MDAnalysis may write the index through symbolic links. This module uses no index
@@ -55,7 +55,7 @@ def opened(trajectory: Any) -> XdrFile | None:
 
 
 class XdrFile:
-    """Reader of the frames of a GROMACS file by number. It uses no index file.
+    """Reader of the frames of a GROMACS file by number, without an index file.
 
     Raises:
         ValueError: the data are invalid or the file ends early (raised by every method).
@@ -270,7 +270,7 @@ class TrrFile(XdrFile):
 
 
 class XtcTrajectory(Trajectory):
-    """An xtc trajectory in Å and ps. Its integer coordinates are decoded to float32."""
+    """An xtc trajectory in Å and ps. Integer coordinates are decoded to float32."""
 
     format = "XTC"
     reader = "MDAnalysis"

@@ -1,10 +1,11 @@
-"""Interpretation of the six box numbers in a DCD file. There are three conventions.
+"""Interpretation of the six box numbers in a DCD file, by three conventions.
 
 DCD files do not record the convention of the box. The six numbers may be lengths and cosines of the angles
-(NAMD, VMD, LAMMPS, MDAnalysis since 2.10). They may be lengths and angles in degrees (CHARMM before version
-22, OpenMM, MDAnalysis before 2.10). They may be a symmetric matrix of lattice vectors (CHARMM since 22). With
-a wrong box, atoms overlap across the boundary, and wrapped atoms seem to leap. If several conventions fit the
-positions, the version number in the header decides. All programs except CHARMM write version 24.
+(NAMD, VMD, LAMMPS, MDAnalysis since 2.10). Other programs write lengths and angles in degrees (CHARMM before
+version 22, OpenMM, MDAnalysis before 2.10). CHARMM since version 22 writes a symmetric matrix of lattice
+vectors. With a wrong box, atoms overlap across the boundary, and wrapped atoms seem to leap. If several
+conventions fit the positions, the version number in the header decides. All programs except CHARMM write
+version 24.
 """
 
 from __future__ import annotations

@@ -50,7 +50,7 @@ def displacements(
 
 
 def same_lattice(one: Box, other: Box, tolerance: float) -> bool:
-    """Return True if two boxes generate the same lattice. Their lattice vectors may differ.
+    """Return True if two boxes generate the same lattice. The lattice vectors may differ.
 
     Components of lattice vectors may differ by up to `tolerance`, in length units.
     """
@@ -134,8 +134,9 @@ class FreeFlight(NamedTuple):
 def flight_of(start: Frame, end: Frame, step: float = 0.0) -> FreeFlight | None:
     """Compare displacements with predictions from velocities. None without velocities or motion.
 
-    `moved` is the ratio of measured to predicted displacements. It is about 1, or less if atoms turn around.
-    `factor` is the ratio by least squares. It is about 1 for the right unit and constant directions.
+    `moved` is the ratio of measured to predicted displacements. The ratio is about 1, or less if atoms turn
+    around. `factor` is the ratio by least squares. The factor is about 1 for the right unit and constant
+    directions.
     """
     if start.velocities is None or end.velocities is None or not end.time > start.time:
         return None

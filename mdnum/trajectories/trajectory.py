@@ -28,7 +28,7 @@ SAMPLE = 8
 
 
 class Trajectory(ABC):
-    """Frames of one file. They can be read any number of times, in order.
+    """Frames of one file, in order. The file can be read any number of times.
 
     A subclass defines `has_atoms`, `raw_frames` and `decoded`. An exception in these methods is reported as
     an unreadable frame.
@@ -143,7 +143,7 @@ class Trajectory(ABC):
                 raise self._unreadable(end, rest)
 
     def sample(self) -> list[Frame]:
-        """Return the first `SAMPLE` requested frames. Fewer if one of them is unreadable.
+        """Return the first `SAMPLE` requested frames. Return fewer if one of these frames is unreadable.
 
         Raises:
             InputError: there is no frame, or the first frame cannot be read.

@@ -240,7 +240,7 @@ def _drawn(table: Mapping[str, np.ndarray], labels: Mapping[str, str]) -> tuple[
 
 
 def _bars(s: Mapping[str, Any], figure: Canvas) -> None:
-    """Draw a bar for each precision. Its length is the number of steps with exact decisions."""
+    """Draw a bar for each precision. The length is the number of steps with exact decisions."""
     axes, rows, last = figure.subplots(), s["policies"], s["steps"]
     place = np.arange(len(rows))[::-1]
     ends = [last if row["horizon"] is None else row["horizon"] for row in rows]

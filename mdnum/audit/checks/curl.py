@@ -1,4 +1,4 @@
-"""Check the work around small closed loops. It is zero for the gradient of an energy."""
+"""Check the work around small closed loops. The work is zero if forces derive from an energy."""
 
 from __future__ import annotations
 
@@ -98,7 +98,7 @@ class CurlCheck(AuditCheck):
 
 
 def agreed(tried: Sequence[Loop]) -> Loop:
-    """Return the loop with the smallest error. Its error is enlarged if other radii disagree.
+    """Return the loop with the smallest error. Enlarge the error if loops of other radii disagree.
 
     The curl is the same for every small circle. The work at a jump of the forces depends on the radius.
     """

@@ -79,9 +79,9 @@ class Slope:
 class ForcesCheck(AuditCheck):
     """Are the forces minus the gradient of `energy` or of `free_energy`?
 
-    The slope of the energy is a finite difference D(h). Its error is estimated as |D(h) - D(h/4)| plus
-    noise/h. Of nine steps h, the one with the smallest error is used. If a deviation is proportional to 1/h,
-    the finding is an energy jump, not a wrong force.
+    The slope of the energy is a finite difference D(h). The error of D(h) is estimated as |D(h) - D(h/4)|
+    plus noise/h. Of nine steps h, the one with the smallest error is used. If a deviation is proportional to
+    1/h, the finding is an energy jump, not a wrong force.
     """
 
     name, title, order, basic, calls = "forces", "Forces", 10, True, 500
@@ -280,7 +280,7 @@ def _best(
 
 
 def _sums(atoms: Atoms, forces: Displacement, noise: NoiseFloor) -> Iterator[dict[str, Any]]:
-    """Net force of a structure, and its net torque if nonperiodic. Both should be zero."""
+    """Net force of a structure, and its net torque if nonperiodic. Correct forces give zero."""
     size = float(np.sum(np.abs(forces)))
     allowed = noise.allowed.force * np.sqrt(len(atoms)) + 40 * np.finfo(float).eps * size
     net = float(np.linalg.norm(forces.sum(axis=0)))

@@ -244,7 +244,7 @@ class Trust(Judgment):
 
 
 def shadow_of(simulation: Simulation, seed: int = 0) -> tuple[Simulation, tuple[str, ...]]:
-    """Return a simulation that rounds differently. Also return the formats narrower than float64.
+    """Return a simulation that rounds differently, and the formats narrower than float64.
 
     A run in formats narrower than float64 is compared with a float64 run. No hardware format is wider than
     float64. A float64 run is compared with one whose initial state is shifted by one rounding error. The

@@ -304,10 +304,10 @@ def _squeezed(room: float, way: ndarray, edge: float, n: int, along: bool) -> li
 
 
 def _among(room: float, way: ndarray, edge: float, n: int, count: int, little: float) -> list[ndarray]:
-    """Return a path on which two of many atoms approach. The others rest or move slightly.
+    """Return a path on which two of many atoms approach. The other atoms rest or move slightly.
 
     The number `n` determines how the motion is divided between the two atoms. All atoms are used equally
-    often as the atom that moves most. Its partner is random.
+    often as the atom that moves most. The partner of this atom is random.
     """
     rng = np.random.default_rng(170 + n)
     most = int(count * (1.0 - (n + 1) * _GOLDEN % 1.0))
