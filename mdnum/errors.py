@@ -32,7 +32,7 @@ def printable(text: str, escape: Callable[[str], str] = python_escape) -> str:
     """Escape all characters of untrusted text that a terminal would interpret.
 
     Control characters are written in Python notation, such as ``\x1b``. Line ends and tabs are kept.
-    Characters that reorder or hide text are escaped, too.
+    Characters that reorder or hide text are also escaped.
     """
     return _CONTROL.sub(lambda found: escape(found[0]), text)
 

@@ -1,9 +1,10 @@
 """Interface by which analyses run and compare simulations.
 
 Molecular dynamics, the ball and simulations of other packages implement `Program`. A program determines every
-bit of a run, including its initial state. Analyses, such as the search for forks, use only the interface
-`Program`. Every time step takes its decisions as input. Decisions of one program can therefore be imposed on
-another. The implementations are `mdnum.rollout.program.MdProgram` and `mdnum.ball.program.BallProgram`.
+bit of a run, including the initial state. Analyses, such as the search for forks, use only the interface
+`Program`. Every time step takes pair or contact decisions as input. Decisions of one program can be imposed
+on another program. The implementations are `mdnum.rollout.program.MdProgram` and
+`mdnum.ball.program.BallProgram`.
 """
 
 from __future__ import annotations
@@ -58,7 +59,7 @@ class Program(Protocol):
     def lockstep(
         self, other: Any, last: int, *, forward: bool, back: bool, guard: float | None
     ) -> Iterator[PairRows]:
-        """Run this program (A) and another one (B), and compare each step.
+        """Run this program (A) and another program (B), and compare each step.
 
         Args:
             forward: whether to run also B with A's decisions imposed, "B|A".

@@ -1,7 +1,7 @@
 """Registries of named objects (cutoffs, integrators, methods) from mdnum and from other packages.
 
-A registry maps a name to a *value*: an object, or what creates it. Another package adds a value by an entry
-point in the registry's group:
+A registry maps a name to a *value*: an object, or a class or function that creates it. Another package adds a
+value by an entry point in the registry's group:
 
     [project.entry-points."mdnum.cutoffs"]
     "smooth-cubic" = "my_package.cutoffs:SmoothCubic"
@@ -62,7 +62,7 @@ def _plugins(group: str, path: tuple[str, ...]) -> tuple[metadata.EntryPoint, ..
 
 @dataclass(frozen=True)
 class Registry(Generic[T]):
-    """Mapping from names to values. Values of other packages come last."""
+    """Mapping from names to values. Values added by other packages come last."""
 
     noun: str  # what one of them is called, for messages
     group: str  # entry points by which other packages add theirs

@@ -57,7 +57,7 @@ class CalculatorError(MdnumError):
 class Meter:
     """Counts the calls to a calculator, and limits calls and time.
 
-    Limits on calls make results independent of the load of the machine. A deadline can end a check earlier.
+    Limits on calls make results independent of the load of the machine. A deadline can also end a check.
     """
 
     calls: int = 0
@@ -93,7 +93,7 @@ class Meter:
 
     @contextmanager
     def limited(self) -> Iterator[None]:
-        """Limit calculator calls and time in a `with` block. Beyond a limit, `TimeUp` is raised."""
+        """Limit calculator calls and time in a `with` block. A call beyond a limit raises `TimeUp`."""
         if up := self.up:
             raise up
         self._limited += 1

@@ -1,9 +1,9 @@
 """Locate jumps and kinks of a curve, down to adjacent floating-point numbers.
 
-A curve consists of an energy and the force along one coordinate. Each value is predicted twice: from the
+A curve consists of an energy and the force along one coordinate. Each energy is predicted twice: from the
 points to its left and to its right. On a smooth curve, the predictions' difference falls with the fourth
-power of the spacing. At a kink, it falls only linearly, and at a jump not at all. This decrease identifies
-the kind of singularity.
+power of the spacing. At a kink, the difference falls only linearly. At a jump, it does not fall. The decrease
+of the difference identifies the kind of singularity.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ SMOOTH = 3  # order of a threshold at which neither energy, force nor curvature 
 
 
 class Curve:
-    """Energy and force along one coordinate. No point is evaluated twice.
+    """Energy and force along one coordinate. No point of the curve is evaluated twice.
 
     Args:
         at: function that returns (energy, force = -dE/dx) at a coordinate.
@@ -162,7 +162,7 @@ def find_jumps(
 
     The smallest detectable jump depends on the curvature of the curve. The function `smallest_steps` returns
     the smallest detectable jump of the force. At a spacing of 0.025 Å, the scan finds 199 of 200 force jumps
-    of 1e-6 eV/Å in five potentials. It finds all larger jumps. It finds energy jumps of 3e-6 eV on a
+    of 1e-6 eV/Å in five potentials. It finds all larger jumps. The scan finds energy jumps of 3e-6 eV on a
     repulsive wall of ε = 1 eV, and of 1e-8 eV on a soft wall.
 
     Args:
@@ -199,10 +199,10 @@ def find_jumps(
 
 
 def measure(curve: Curve, low: float, high: float, room: float, exact: bool, curved: bool = True) -> Jump:
-    """Measure the jumps between `low` and `high`, and those of a smooth curve.
+    """Measure the jumps between `low` and `high`, and the jumps of a smooth curve.
 
-    Values on either side are medians of four, so that one rounding error has no effect. The curvature is
-    computed from one-sided differences of the force.
+    Energies and forces on either side are medians of four values, so that one rounding error has no effect.
+    The curvature is computed from one-sided differences of the force.
 
     Args:
         room: length, on either side, within which the curve may be evaluated.
@@ -302,7 +302,7 @@ def _outliers(
 
 
 def _mismatch(curve: Curve, places: Float[np.ndarray, "points"]) -> Float[np.ndarray, "3 intervals"]:
-    """Return three mismatches for each interval. They are small on a smooth curve.
+    """Return three mismatches for each interval. Mismatches are small on a smooth curve.
 
     The first two are differences of the predictions of energy and force. The third, energy change plus work,
     falls with the fifth power of the spacing. The third mismatch detects the smallest jumps of the energy
@@ -373,7 +373,7 @@ def locate(curve: Curve, row: int, left: float, right: float) -> tuple[float, fl
 
 
 def _level(curve: Curve, row: int, left: float, right: float) -> Callable[[float], float]:
-    """Remove the smooth change from the energy or force. Only jumps remain."""
+    """Remove the smooth change from the energy or force. The remaining curve changes only at jumps."""
     if row == 1:
         back = left - (right - left)
         slope_before = (curve(left)[1] - curve(back)[1]) / (left - back)
@@ -382,7 +382,7 @@ def _level(curve: Curve, row: int, left: float, right: float) -> Callable[[float
 
 
 def _kink(curve: Curve, left: float, right: float, room: float) -> list[Jump]:
-    """Locate a kink of the force, where both sides' extrapolations intersect."""
+    """Locate a kink of the force, where the extrapolations from both sides intersect."""
     width = min(room / 8, 1e-3)
     middle, reach = 0.5 * (left + right), max(0.5 * (right - left), width / 8)
     roots = np.roots(-_pieces(curve, middle, reach, width, 3))
@@ -404,7 +404,7 @@ def _pieces(curve: Curve, middle: float, reach: float, width: float, degree: int
 def _third(curve: Curve, left: float, right: float, room: float, noise: float) -> list[Jump]:
     """Locate a jump of the energy's third derivative.
 
-    The fit width is the one for which half of it changes the result least.
+    The fit width is chosen so that half the width gives a similar result.
     """
     reach = 0.5 * (right - left)
     widths = [room / part for part in (6, 12, 24, 48) if room / part > 4 * reach]

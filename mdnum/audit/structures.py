@@ -24,9 +24,10 @@ _NEAREST = 0.3  # distances are walked from the first
 
 
 def read_structure(words: str | Path) -> Atoms:
-    """Read a structure with ASE. `file@5` is the sixth structure, `file` the last one.
+    """Read a structure with ASE. `file@5` is the sixth structure of a file, and `file` the last structure.
 
-    The text after @ is an index or a database selection (`file.db@id=3`). It must select one structure.
+    The text after @ is an index or a database selection (`file.db@id=3`). The text must select exactly one
+    structure.
 
     Raises:
         InputError: the file is missing, ASE cannot read it, it has no atoms, or a number is not finite.
@@ -83,7 +84,7 @@ class Pair:
     moves: Literal["atom", "molecule"] = "atom"
 
     def at(self, distance: float) -> Atoms:
-        """Return the particles with their reference atoms at exactly this distance."""
+        """Return the two particles with their reference atoms at exactly the given distance."""
         both = self._together.copy()
         both.positions[len(self.first) :, 0] += distance
         return both
@@ -93,7 +94,7 @@ class Pair:
         return self.surrounded(self.first + self.second)
 
     def surrounded(self, atoms: Atoms, middle: bool = False) -> Atoms:
-        """Put atoms into the cell of the particles. If `middle`, center them."""
+        """Put atoms into the cell of the particles. If `middle`, center the particles."""
         if self.box:
             atoms.set_cell([self.box] * 3)
             if middle:
@@ -107,7 +108,7 @@ class Pair:
         return np.linalg.norm(moved - self.first.positions[:, None], axis=2).ravel()[1:]
 
     def curve(self, subject: CalculatorSubject) -> Curve:
-        """Energy by distance, and the force on the second particle. Repulsion is positive."""
+        """Energy by distance, and the force on the second particle. A repulsive force is positive."""
 
         def at(distance: float) -> tuple[float, float]:
             energy, forces = subject.both(self.at(distance))
@@ -119,9 +120,9 @@ class Pair:
 def pairs(subject: CalculatorSubject, most: int = 6) -> tuple[list[Pair], list[Skipped]]:
     """Return a pair of particles for every two species, frequent species first.
 
-    A particle is a single atom if the calculator supports this. Otherwise, each atom gets two companions:
-    some potentials divide by the number of neighbors. If this fails too, as for rigid water, molecules are
-    used.
+    A particle is a single atom if the calculator supports single atoms. If not, each atom gets two
+    companions: some potentials divide by the number of neighbors. Where companions fail, as for rigid water,
+    particles are molecules.
 
     Returns:
         (pairs, omitted pairs with the reason).
@@ -149,7 +150,7 @@ def pairs(subject: CalculatorSubject, most: int = 6) -> tuple[list[Pair], list[S
 
 
 def modified(atoms: Atoms, scaled: bool = False, **values: Any) -> Atoms:
-    """Return a modified copy of a structure. If `scaled`, positions follow the cell."""
+    """Return a modified copy of a structure. If `scaled` is True, positions are scaled with the cell."""
     there = atoms.copy()
     if "cell" in values:
         there.set_cell(values.pop("cell"), scale_atoms=scaled)
@@ -215,7 +216,7 @@ def _part(atoms: Atoms, indices: np.ndarray) -> Atoms:
 
 
 def _molecules(subject: CalculatorSubject) -> list[Pair]:
-    """Return a pair of molecules, identical if possible. No pair for a single molecule."""
+    """Return a pair of molecules, identical if possible. No pair is returned for a single molecule."""
     atoms, groups = subject.atoms, molecules(subject.atoms)
     if not 2 <= len(groups) <= len(atoms) / 2:
         return []
@@ -263,8 +264,8 @@ def coarse_scan(subject: CalculatorSubject, curve: Curve) -> tuple[Float[np.ndar
 def group(atoms: Atoms) -> int | None:
     """Return the number of atoms per molecule. None if molecules differ.
 
-    A salt crystal can have a repeating sequence of species, too. Atoms of a molecule must be bonded (by
-    covalent radii) to one another only.
+    A salt crystal can also have a repeating sequence of species. Atoms of a molecule must be bonded (by
+    covalent radii) only to one another.
     """
     numbers = atoms.numbers
     if len(set(numbers)) < 2:

@@ -99,7 +99,7 @@ def differences(one: EnergyForces, other: EnergyForces) -> tuple[float, float]:
 def not_repeatable(
     how: str, energy: float, force: float, typical: float, kT: float, **values: Any
 ) -> Observed:
-    """Report that two evaluations of one structure differ. Only rounding is no error.
+    """Report that two evaluations of one structure differ. Rounding errors are only a warning.
 
     Args:
         how: how the difference was discovered, as the name of a text variant.
@@ -127,10 +127,10 @@ class LoadedCalculator:
 class CalculatorSubject:
     """An ASE calculator and the structure for which it is audited.
 
-    ASE returns its cached energy after moves below 1e-15 Å. This class therefore clears the cache after any
-    change. If the input did not change, cached results are used. `forget` forces a calculation. The
-    calculator is attached to the atoms, as in a run. A `CalculatorError` is raised if the calculator fails or
-    returns nan. The structure is then saved.
+    ASE returns its cached energy after moves below 1e-15 Å. CalculatorSubject clears the cache after any
+    change of the structure. If the input did not change, cached results are used. The method `forget` forces
+    a new calculation. The calculator is attached to the atoms, as in a run. A `CalculatorError` is raised if
+    the calculator fails or returns nan. The structure is then saved.
 
     Args:
         name: the calculator as the user named it.
@@ -210,7 +210,8 @@ class CalculatorSubject:
     def energies(self, atoms: Atoms) -> tuple[float, float | None]:
         """Return (energy consistent with the forces, energy written to the log), eV.
 
-        In ASE they are `free_energy` and `energy`. The logged energy is None if there is only one.
+        In ASE, the energies are `free_energy` and `energy`. The logged energy is None if only one energy
+        exists.
         """
         asked = self._ask(atoms)
         both = self._answer(lambda: self._energies(asked), asked, "energy")
@@ -243,7 +244,7 @@ class CalculatorSubject:
         return self.energy(atoms), self.forces(atoms)
 
     def try_both(self, atoms: Atoms) -> Answered:
-        """Return energy and forces, or the calculator's error. Save no structure."""
+        """Return energy and forces, or the calculator's error. In either case, no structure is saved."""
         try:
             with self.trying():
                 return self.both(atoms)
@@ -256,7 +257,7 @@ class CalculatorSubject:
 
     @contextmanager
     def trying(self) -> Iterator[None]:
-        """Within this block, do not save structures on which the calculator fails."""
+        """Within the `with` block, do not save structures on which the calculator fails."""
         before, self.saving = self.saving, False
         try:
             yield
@@ -266,8 +267,8 @@ class CalculatorSubject:
     def again(self, atoms: Atoms, energy: float | None = None, forces: Forces | None = None) -> bool:
         """Evaluate a structure again, and count any difference in `repeats`.
 
-        A difference is random only if the second result agrees with a new calculator object. Otherwise,
-        earlier evaluations may be the reason.
+        A difference is random only if the second result agrees with a new calculator object. If the results
+        of the two objects differ, earlier evaluations may be the reason.
 
         Args:
             energy: the earlier energy, eV; the energy or the forces are required.

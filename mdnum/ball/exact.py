@@ -1,16 +1,16 @@
 """Exact motion of a bouncing ball, and its derivatives with respect to all parameters.
 
-A ball starts at height y0 with velocity v0, under gravity g. It reaches the floor at t_1 = (v0 + s) / g with
-speed s = sqrt(v0² + 2 g y0). With restitution e, impact n has speed e^(n-1) s. The next impact is 2 e^n s / g
-later. Therefore
+A ball starts at height y0 with velocity v0, under gravity g. The ball reaches the floor at t_1 = (v0 + s) / g
+with speed s = sqrt(v0² + 2 g y0). With restitution e, impact n has speed e^(n-1) s. The next impact is 2 e^n
+s / g later. Therefore
 
     t_n = t_1 + (2 s / g) (e + e² + ... + e^(n-1)),   t_rest = t_1 + (2 s / g) e / (1 - e).
 
 Infinitely many impacts take place before the finite time t_rest (Zeno behavior). With a spring and a damper,
-y'' = -g - k y - c y' below the floor. A simulation with penalty contacts discretizes this equation in time.
-The limit of stiff springs differs from a ball with restitution, unless e = 1.
+y'' = -g - k y - c y' below the floor. A simulation with penalty contacts discretizes the equation of motion
+in time. The limit of stiff springs differs from a ball with restitution, unless e = 1.
 
-All computations use numpy in float64. This reference shares no code with the simulations of this package.
+All computations use numpy in float64. The exact solution shares no code with the simulations of this package.
 """
 
 from __future__ import annotations
@@ -91,7 +91,7 @@ class _Motion:
         return self.state(t)[0]
 
     def velocity(self, t: Times) -> Known:
-        """Return the velocity (m/s) at time t (s). At an impact, it is the later velocity."""
+        """Return the velocity (m/s) at time t (s). At an impact, return the velocity after the impact."""
         return self.state(t)[1]
 
 
@@ -103,7 +103,7 @@ def _down(p: Parameters) -> tuple[complex, complex]:
 
 
 def _impact(p: Parameters, n: Any) -> tuple[Any, Any]:
-    """Return the time (s) of impact n, and the speed (m/s) after it."""
+    """Return the time (s) of impact n, and the speed (m/s) after the impact."""
     first, speed = _down(p)
     e = p["restitution"]
     power, between = _powers(e, np.asarray(n, np.float64) - 1)
@@ -114,7 +114,7 @@ def _impact(p: Parameters, n: Any) -> tuple[Any, Any]:
 class ExactImpact(_Motion):
     """The exact motion of a ball that bounces with a coefficient of restitution.
 
-    Impacts are numbered from 1. At an impact, height and velocity are those after it.
+    Impacts are numbered from 1. At the time of an impact, height and velocity are those after the impact.
 
     Raises:
         InputError: a parameter is out of range, or the ball starts at rest on the floor.

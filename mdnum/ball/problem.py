@@ -106,7 +106,7 @@ class BallProblem:
     def value(
         self, overrides: Mapping[str, Any] | None = None, imposed: BallDecisions | None = None
     ) -> float:
-        """Compute the loss. Other parameter values need no new compilation.
+        """Compute the loss. Other parameter values do not need another compilation.
 
         Args:
             imposed: decisions of every step (first axis: steps) that replace the model's own decisions.
@@ -216,7 +216,7 @@ def _value_and_grad(bare, values, world, y0, v0, imposed, scale):
 def arrive(world: World, y0: Float[Array, "balls"], steps: int, name: str) -> tuple[Array, Array]:
     """Compute final heights and their derivatives with respect to one parameter.
 
-    The function is compiled only once.
+    The compiled function is used for any time step and number of steps.
     """
     return _arrive(world, y0, jnp.asarray(steps), name)
 

@@ -39,10 +39,10 @@ _MOST_ITERATIONS = 2**31 - 1  # iterations are counted in 32 bits
 
 
 class World(eqx.Module):
-    """Model of balls above a floor at height 0, without their state.
+    """Model of balls above a floor at height 0, without heights and velocities.
 
     `World.create` checks all numbers and casts them to the dtypes in `policy`. Pass a `World` to jitted code
-    as an argument. Otherwise, the compiler may remove operations with zeros.
+    as an argument. If a `World` is a constant, the compiler may remove operations with zeros.
 
     Attributes:
         contact: contact model of the floor.
@@ -130,7 +130,7 @@ class World(eqx.Module):
         return attrgetter(self._known(name))(self)
 
     def with_values(self, values: Mapping[str, Any]) -> World:
-        """Return the model with other values. They are not checked, so jax tracers are allowed.
+        """Return the model with other values. The values are not checked, so jax tracers are allowed.
 
         Raises:
             InputError: the model has no such parameter.

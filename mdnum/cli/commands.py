@@ -94,7 +94,7 @@ def _top(
 
 
 class _Questions(TyperGroup):
-    """Group of subcommands. Without the name of one, the default is called."""
+    """Group of subcommands. The default subcommand is called if the first argument is not a subcommand."""
 
     group: Mapping[str, Any]
 

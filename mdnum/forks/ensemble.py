@@ -1,7 +1,7 @@
 """Measure properties of perturbed runs, and change programs to validate the test.
 
-Every property (feature) is a continuous function of the positions. Pairs are therefore counted with hat
-functions and not in bins.
+Every property (feature) is a continuous function of the positions. Pairs are counted with hat functions and
+not in bins.
 """
 
 from __future__ import annotations
@@ -44,7 +44,7 @@ _NUMBERS = (
 def nodes_of(simulation: Simulation, start: Start) -> Float[np.ndarray, "nodes"]:
     """Return the nodes of the pair histogram and its upper end.
 
-    They extend from the closest pairs to the largest distance.
+    The nodes extend from the closest pairs to the largest distance.
     """
     simulation = simulation.in_row(start.state.cells[0])
     half = float(np.min(simulation.cell.widths)) / 2
@@ -108,7 +108,7 @@ def hats(
     """Count pair distances with hat functions: each contributes to two nodes.
 
     The contribution to a node grows linearly as the distance approaches the node. A distance below the first
-    node is counted at this node. No count jumps when a distance passes the last node.
+    node is counted at this node. No count jumps when a pair distance passes the last node.
     """
     width = nodes[1] - nodes[0]
     place = np.clip((distances - nodes[0]) / width, 0.0, len(nodes) - 1.0)
@@ -174,7 +174,7 @@ def ensemble(
 def steps_to_diverge(simulation: Simulation, start: Start | None, separation: float, seed: int) -> int | None:
     """Return the step at which two runs have moved apart by a distance.
 
-    The result is None if this takes over 20,000 steps, or if a run blows up.
+    The result is None if the runs stay together for 20,000 steps, or if a run blows up.
     """
     steps = range(_EVERY, _LONGEST + 1, _EVERY)
     pair = [stretches(simulation, one, steps) for one in starts(simulation, 2, seed, start)]
@@ -202,8 +202,9 @@ class Change:
 def planted(a: Simulation) -> tuple[Change, ...]:
     """Create the programs with deliberate changes that are possible for a simulation.
 
-    The test must detect a longer time step and a shorter cutoff. It must accept another precision of forces,
-    order of pairs or neighbor search. For a many-body potential, cutoff and precision are not changed.
+    The test must detect a longer time step and a shorter cutoff. The test must accept another precision of
+    forces, order of pairs or neighbor search. For a many-body potential, cutoff and precision are not
+    changed.
     """
     longer = eqx.tree_at(lambda one: one.timestep, a.integrator, a.integrator.timestep * _TIMESTEP)
     search = next(name for name in BUILDERS if name != a.builder)

@@ -227,8 +227,7 @@ def _of_frames(first: RunFolder, second: RunFolder, where: str) -> FolderFork:
 def choices(programs: list[Difference]) -> list[str]:
     """Return the choices in which two systems differ, given the differing keys.
 
-    All dtypes count as one choice, and so do a cutoff and its parameters.
-    """
+    All dtypes count as one numerical choice. A cutoff and its parameters count as one choice."""
     keys = [key for key, _, _ in programs]
     out: dict[str, None] = {}
     for key, one, other in programs:
@@ -248,7 +247,7 @@ def _different(one: Mapping[str, Any], other: Mapping[str, Any]) -> list[Differe
 def _alone(
     first: RunFolder, second: RunFolder, table: str, labels: tuple[str, ...], steps: int, clock: str = "step"
 ) -> tuple[int | None, list[StoredFlip]]:
-    """Return the first step with flips in only one table, and these flips."""
+    """Return the first step with flips that only one of two tables contains, and these flips."""
     known = [folder.table(table, rows=1).column_names for folder in (first, second)]
     names = (clock, *labels, "entered", *["terms"] * all("terms" in one for one in known))
     further = ("distance", "ambiguous") if table == "flips" else ()
@@ -357,7 +356,7 @@ def _starts(first: RunFolder, second: RunFolder, programs: list[Difference], whe
 
 
 def _same_system(one: Any, other: Any) -> Iterator[tuple[bool, str]]:
-    """Compare two sets of atoms. Yield for each property whether it agrees, and a message."""
+    """Compare two sets of atoms. Yield for each property whether the two sets agree, and a message."""
     yield len(one) == len(other), f"numbers of atoms differ, {len(one)} and {len(other)}"
     symbols = [each.get_chemical_symbols() for each in (one, other)]
     yield symbols[0] == symbols[1], "species or their order differ"

@@ -1,9 +1,10 @@
-"""Derivatives of averages, from frames alone. The dynamics is not differentiated.
+"""Compute derivatives of averages from the frames of one run. The dynamics of the run is not differentiated.
 
 The derivative of an average has up to three contributions. First, at fixed positions, the value of the
-observable in each frame changes. Second, an observable may jump when a pair enters the cutoff. This
-contribution is the jump times the density of pairs at the cutoff. Derivatives at fixed decisions omit this
-contribution. Third, with a thermostat, the statistical weight exp(-U/kT) of each frame changes.
+observable in each frame changes. Second, an observable may jump when a pair enters the cutoff. The
+contribution of jumps is their height times the density of pairs at the cutoff. Derivatives at fixed decisions
+omit the contribution of jumps. Third, with a thermostat, the statistical weight exp(-U/kT) of each frame
+changes.
 """
 
 from __future__ import annotations
@@ -209,8 +210,8 @@ def density(
 
     The delta function is replaced by a parabolic kernel of finite width. The bias contains only even powers
     of the width. Extrapolation from three widths (w, w/2, w/4) removes the second and fourth powers. The
-    result uses the widest kernels that agree with all narrower ones. Results agree if they differ by at most
-    two standard errors.
+    result uses the widest kernels that agree with all narrower kernels. Two extrapolations agree if they
+    differ by at most two standard errors.
 
     Args:
         weights: one per frame and pair type. reach: the largest width, length.

@@ -45,7 +45,7 @@ class FixedPointRule(eqx.Module):
     """Derivative of the contact's fixed point, not of its iterations.
 
     For a ball in contact, y ← G(y) = y + gain max(0, -y) approaches 0 from below. At y = 0, dG/dy is
-    discontinuous. The rule therefore uses the value for y < 0. Implicit differentiation, (1 - dG/dy) dy =
+    discontinuous. The rule uses the derivative of G for y < 0. Implicit differentiation, (1 - dG/dy) dy =
     dG/dgain dgain, gives gain dy = -y dgain for each ball.
     """
 
@@ -73,7 +73,7 @@ class _Settled(eqx.Module):
     """Rule that moves balls below the floor up to the floor."""
 
     def attach(self, y, gain, contact):
-        """Return 0 for balls in contact below the floor, otherwise y."""
+        """Return 0 for balls in contact below the floor, and y for other balls."""
         return jnp.where(contact & (y < 0), jnp.zeros_like(y), y)
 
 
@@ -81,8 +81,8 @@ class _Settled(eqx.Module):
 class Implicit(BallMethod):
     """Gradient method: derivative of the fixed point of the contact.
 
-    The loss uses the executed iterations, the derivative their limit. For the gain k, `unrolled` gives a
-    nonzero derivative, an artifact of the tolerance.
+    The loss uses the executed iterations. The derivative is that of their limit. For the gain k, `unrolled`
+    gives a nonzero derivative, an artifact of the tolerance.
     """
 
     regularization: float = 0.0  # added to 1 - dG/dy, for a gain too small to divide by
@@ -140,8 +140,8 @@ def _with_contact(problem: BallProblem, contact: Any) -> BallProblem:
 class SoftImpact(eqx.Module):
     """Smooth model of an impact: a spring that is softer on the rebound.
 
-    The stiffness is k on the way down and restitution² k on the way up. The ball therefore leaves the floor
-    at `restitution` times its impact speed.
+    The stiffness is k on the way down and restitution² k on the way up. The ball leaves the floor at
+    `restitution` times its impact speed.
 
     Source: latching spring of Walton and Braun (1986), here with smooth transitions.
     """
@@ -152,13 +152,13 @@ class SoftImpact(eqx.Module):
     slow: Any  # in velocity, of the passage, m/s
 
     def acceleration(self, y, v, free, contact, r):
-        """Return the acceleration by control, gravity and spring. Contact decisions are not used."""
+        """Return the acceleration by control, gravity and spring. The contact decision is not used."""
         depth = self.eps * jax.nn.softplus(-y / self.eps)
         share = self.restitution**2
         return free + self.k * depth * (share + (1 - share) * jax.nn.sigmoid(-v / self.slow))
 
     def move(self, motion: Motion) -> Moved:
-        """Integrate one step with the spring. The contact decision is only recorded."""
+        """Integrate one time step of a ball with a contact spring. The contact decision is only recorded."""
 
         def pull(y, v, contact):
             return self.acceleration(y, v, motion.free, contact, motion.rounding)
@@ -259,9 +259,9 @@ class ThroughContacts(BallMethod):
 
     Contact is decided at the end of each time step. A ball that starts higher reaches the floor later. The
     derivative of the time steps omits the change of the contact time. A saltation matrix at every contact
-    adds this change to the derivative. If impacts are located within a step, the program's derivative is
-    already complete. Contact by projection is differentiated like an impact. Without a damper, the result is
-    the same as from `unrolled`.
+    adds the change of the contact time to the derivative. If impacts are located within a step, the program's
+    derivative is already complete. Contact by projection is differentiated like an impact. Without a damper,
+    the result is the same as from the method `unrolled`.
     """
 
     name = "event-aware"
@@ -312,7 +312,7 @@ class _SaltatingReset:
     """Contact that resets velocities, but is differentiated like continuous motion."""
 
     def move(self, motion: Motion) -> Moved:
-        """Compute one step with a contact, and its continuous derivative."""
+        """Compute one time step with a contact, differentiated as continuous motion."""
         made = super().move(motion)  # type: ignore[misc]
         height, v = motion.integrator.fly(motion.y, motion.v, motion.free, motion.rounding)
         arrived, nothing, bounce = lax.stop_gradient(v), jnp.zeros_like(v), self.restitution.astype(v.dtype)  # type: ignore[attr-defined]
@@ -342,7 +342,7 @@ class _SaltatingProjection(_SaltatingReset, Projection):
 
 class _SaltatingPenalty(Penalty):
     def move(self, motion: Motion) -> Moved:
-        """Compute one step with a damped spring. Add the saltation term."""
+        """Compute one time step of a ball with a damped spring. Add the saltation term."""
         contact = super().move(motion).record.contact
         y, v = lax.stop_gradient((motion.y, motion.v))
         jump = jnp.where(contact, -1.0, 1.0).astype(v.dtype) * lax.stop_gradient(self.damping) * v

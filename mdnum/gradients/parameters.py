@@ -63,7 +63,7 @@ class Direction(NamedTuple):
 def quantities(force: PairForce | ManyBodyForce) -> Any:
     """Return the differentiable parameters of a force, as a pytree of arrays.
 
-    For a many-body potential, it contains arrays and constants by name.
+    For a many-body potential, the pytree has arrays and constants by name.
     """
     return force.model if isinstance(force, PairForce) else manybody.quantities_of(force.potential)
 
@@ -76,8 +76,7 @@ def with_quantities(force: PairForce | ManyBodyForce, values: Any) -> PairForce 
 
 
 def onto_start(simulation: Simulation, start: Any, extra: Any) -> tuple[Any, Array, Array]:
-    """Propagate derivatives from the extra state of step 0 (such as thermostat variables) to parameters,
-    positions and velocities.
+    """Propagate derivatives of the extra state of step 0 to parameters, positions and velocities.
 
     Args:
         start: the state of step 0.
@@ -151,7 +150,7 @@ def _places(simulation: Simulation, name: str) -> list[tuple[Callable[[Any], Any
 
 
 def gradient(simulation: Simulation, parts: Cotangents, name: str) -> Float[np.ndarray, "..."]:
-    """Return the derivative with respect to a parameter, in its shape."""
+    """Return the derivative with respect to a parameter, in the shape of the parameter."""
     entry = parameters.entry(simulation, name)
     if name == "box.scale":
         return np.asarray(parts.scale)

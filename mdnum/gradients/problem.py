@@ -86,7 +86,7 @@ class Problem:
         return replace(self, simulation=parameters.with_values(self.simulation, values)) if values else self
 
     def value(self, values: Values | None = None) -> Any:
-        """Run the simulation and return its loss. It may be complex."""
+        """Run the simulation and return its loss. The loss may be a complex number."""
         made = self.at(values or {})
         runs = (RunTape(one.simulation, one.loss, one.steps, budget=0) for one in made.parts or (made,))
         return sum(factor * run.value for factor, run in zip((1, 1j), runs, strict=False))

@@ -117,7 +117,7 @@ def tangents(
 
 
 def by_column(tape: RunTape, total: Any) -> Float[np.ndarray, "columns"]:
-    """Compute derivatives of the loss from the tangents of its frame sums."""
+    """Compute derivatives of the loss from the tangents of its sums over frames."""
 
     def one(tangent):
         return jax.jvp(lambda total: tape.loss.value(total, tape.frames), (tape.total,), (tangent,))[1]
@@ -126,7 +126,7 @@ def by_column(tape: RunTape, total: Any) -> Float[np.ndarray, "columns"]:
 
 
 def _evaluate(force: PairForce | ManyBodyForce, x, tables: Tables, told, values, matrix) -> Forces:
-    """Evaluate forces with other parameters and box. Nearest images are kept."""
+    """Evaluate forces with other parameters and lattice vectors. Nearest images are kept."""
     other: Any = with_quantities(force, values)
     other = replace(other, cell=replace(force.cell, matrix=matrix))
     if isinstance(force, PairForce):

@@ -4,8 +4,8 @@ An isotropic barostat (`box = "isotropic"`) changes only the volume of the box. 
 changes the box without rotating it. A strain or its rate is a number (isotropic) or a symmetric matrix. The
 pressure is (2 K + virial) / 3 V with the instantaneous kinetic energy K. The pressure tensor is Π / V with Π
 = Σ m v ⊗ v + Σ r ⊗ F. Volumes are sampled with the weight exp(-(U + p V) / k_B T) dV. Full boxes h have the
-measure dh / det(h)², where det(h) = V. At zero total momentum, the center of mass does not contribute. The
-mean volume of an ideal gas is then N k_B T / p.
+measure dh / det(h)², where det(h) = V. At zero total momentum, the center of mass does not contribute. At
+zero momentum, the mean volume of an ideal gas is N k_B T / p.
 """
 
 from __future__ import annotations
@@ -129,14 +129,14 @@ class Barostat(Integrator):
             raise InputError(message, where="dynamics.kind", remedy="Use nose-hoover, csvr or langevin")
 
     def motion(self, v: Vector, masses: Masses) -> Rate:
-        """Return Σ m v ⊗ v (an energy). For an isotropic box, a third of its trace."""
+        """Return Σ m v ⊗ v (an energy). For an isotropic box, return a third of the trace of this tensor."""
         if not self.anisotropic:
             return 2 * super().kinetic(v, masses) / 3
         v = v.astype(jnp.float64)
         return symmetric(products(v, masses * v))
 
     def excess(self, motion: Rate, at: AtStep) -> Rate:
-        """Return Π - p V at the target pressure p. For an isotropic box, its mean diagonal."""
+        """Return Π - p V at the target pressure p. For an isotropic box, return the mean diagonal."""
         virial = at.tensor if self.anisotropic else at.virial / 3
         assert virial is not None
         return motion + 0.5 * (virial + virial.T) - self.pressure * volume(at.cell) * unit(motion)
@@ -164,9 +164,9 @@ class MTK(Barostat):
 
     Martyna, Tobias, Klein, J. Chem. Phys. 101, 4177 (1994), with the operator splitting of Tuckerman et al.,
     J. Phys. A 39, 5629 (2006), eq. 38 ff. A step applies chains, kick of the box, kick of the atoms and
-    drift, then the same in reverse. The inertia of the box is (N_f + 3) k_B T τ_p², for a full box a third of
-    this. An isotropic box has one degree of freedom, a full box six. The drift is exact for a constant strain
-    rate a: x(t) = x exp(a t) + v t exp(a t / 2) sinh(a t / 2) / (a t / 2).
+    drift, then the same operators in reverse. The inertia of the box is (N_f + 3) k_B T τ_p², for a full box
+    a third of this. An isotropic box has one degree of freedom, a full box six. The drift is exact for a
+    constant strain rate a: x(t) = x exp(a t) + v t exp(a t / 2) sinh(a t / 2) / (a t / 2).
 
     Example:
         >>> mdnum.simulation(atoms, argon, cut, timestep=0.002, temperature=90, pressure=0.0,
@@ -196,7 +196,7 @@ class MTK(Barostat):
         return (self.freedom(masses) + 3) / share * self.kT * self.pressure_relaxation**2
 
     def _held(self, v, motion, extra, masses, time):
-        """Advance the thermostat chains of box and atoms. Scale velocities and kinetic tensor."""
+        """Advance the thermostat chains of box and atoms. Scale the velocities and the kinetic tensor."""
         freedom, kT = self.freedom(masses), self.kT
         own, of_box = self._own(extra, masses)
         scale, atoms = extra.atoms.act(0.5 * trace(motion), freedom, kT, self.relaxation, time)
@@ -268,12 +268,12 @@ class Move(NamedTuple):
 class CellRescaling(Barostat):
     """Integrator for the isothermal-isobaric ensemble: first-order stochastic cell rescaling with CSVR.
 
-    In the middle of the drift, an Euler step changes the square root of the volume. Its noise does not depend
-    on the volume. Velocities are scaled inversely (Bernetti, Bussi, J. Chem. Phys. 153, 114107, 2020, section
-    II C). In a full box, the traceless strain is changed, too (del Tatto, Raiteri, Bernetti, Bussi, Applied
-    Sciences 12, 1139, 2022). Its noise uses the geometric mean of old and new volume. Step probabilities give
-    an effective energy, the total energy minus heat and work. The effective energy is conserved within the
-    time-step error.
+    In the middle of the drift, an Euler step changes the square root of the volume. The noise of the square
+    root does not depend on the volume. Velocities are scaled inversely (Bernetti, Bussi, J. Chem. Phys. 153,
+    114107, 2020, section II C). In a full box, the traceless strain also changes (del Tatto, Raiteri,
+    Bernetti, Bussi, Applied Sciences 12, 1139, 2022). The noise of the strain uses the geometric mean of old
+    and new volume. Step probabilities give an effective energy, the total energy minus heat and work. The
+    effective energy is conserved within the time-step error.
 
     Example:
         >>> mdnum.simulation(atoms, argon, cut, timestep=0.002, temperature=90, pressure=0.0,
@@ -304,7 +304,7 @@ class CellRescaling(Barostat):
         return self.compressibility / (4 * self.pressure_relaxation)
 
     def _forces(self, v, at):
-        """Return √V, its force, and the traceless excess pressure tensor.
+        """Return √V, the force on √V, and the traceless excess pressure tensor.
 
         The force is k_B T d ln P / d√V for the probability density P ~ √V exp(-(U + K + p V) / k_B T).
         """
@@ -313,7 +313,7 @@ class CellRescaling(Barostat):
         return root, (2 * part + self.kT) / root, excess - part * unit(excess)
 
     def _shear(self, root, after):
-        """Return the mobility of a traceless strain, symmetric in both √V."""
+        """Return the mobility of a traceless strain. Old and new √V enter symmetrically."""
         return 4 / 3 * self._mobility / (root * after)
 
     def finish(self, v, extra, at, time):

@@ -1,4 +1,4 @@
-"""Call energy functions with neighbor lists, whatever their arguments are.
+"""Call energy functions with neighbor lists, whatever the functions' arguments are.
 
 Functions for jax-md differ in arguments, box, positions (real or fractional), neighbor lists and return
 value. The signature determines the order of the arguments. All other properties are determined by trial calls
@@ -38,7 +38,7 @@ ENERGIES: Mapping[str, float] = {
 
 @dataclass(frozen=True)
 class Convention:
-    """Calling convention of an energy function. Trial calls set the fields after `keywords`."""
+    """Calling convention of an energy function. Trial calls determine the fields after `keywords`."""
 
     native: bool = False  # (parameters, positions, neighbor, cell)
     parameters: bool = False  # they come first
@@ -202,9 +202,9 @@ def energy_function(
     Supported forms are `energy_fn(R, neighbor, **kw)`, `energy_fn(params, R, neighbor, **kw)`,
     `energy_fn(R, *, box=, neighbor=, perturbation=)`, and mdnum's own form
     `f(parameters, positions, neighbor, cell)`. The function is given alone or with jax-md's neighbor
-    functions. The function may use neighbor lists with several images. It returns a number, a number per
-    atom, or a dictionary with key "total" or "energy". Trial calls find out the form of box vectors and
-    positions.
+    functions. The function may use neighbor lists with several images. The energy function returns a number,
+    a number per atom, or a dictionary with key "total" or "energy". Trial calls find out the form of box
+    vectors and positions.
 
     Example:
         >>> made = jax_md.energy.lennard_jones_neighbor_list(displacement, box)

@@ -34,12 +34,12 @@ class RebuildRule:
     def first_allowed(self) -> int:
         """Smallest age, in steps, at which a neighbor list can be rebuilt.
 
-        LAMMPS calls such a rebuild dangerous: it may be too late."""
+        LAMMPS calls a rebuild at the smallest age dangerous, since the rebuild may be too late."""
         return max(self.every, self.delay)
 
     @property
     def safe(self) -> bool:
-        """True if lists are always rebuilt before atoms have moved too far."""
+        """True if every list is rebuilt before atoms have moved too far."""
         return self.check and self.every == 1 and self.delay <= 1
 
 
@@ -107,7 +107,7 @@ class PairTable:
         return first, second, i + np.repeat(np.arange(channels), once.sum()) * len(self.order), j
 
     def unsorted(self) -> Int[np.ndarray, "atoms slots"]:
-        """Return each atom's neighbors in input order. Empty slots contain the number of atoms."""
+        """Return each atom's neighbors in input order. Empty slots of a row contain the number of atoms."""
         atoms = self.index.shape[1]
         labels = np.append(self.order, atoms).astype(np.int32)
         out = np.empty((atoms, self.slots), np.int32)
@@ -127,7 +127,8 @@ class ListBuilder(Protocol):
     def build(
         self, positions: Float[np.ndarray | Array, "atoms 3"], cell: Cell, r_list: float, slots: int
     ) -> tuple[Int[np.ndarray | Array, "slots atoms"], Int[np.ndarray | Array, "atoms"], int]:
-        """Return neighbor table, atom order and largest neighbor count. Above `slots`, pairs are missing."""
+        """Return neighbor table, atom order and neighbor count. If the count exceeds `slots`, pairs are
+        missing."""
         ...
 
 
@@ -169,7 +170,7 @@ BUILDERS.add("device", "mdnum.md.device_search:BUILDER")
 
 
 def check_radius(cell: Cell, r_cut: float, skin: float) -> None:
-    """Raise an error if r_cut + skin is too large for the minimum image.
+    """Raise an error if r_cut + skin is too large for the minimum-image convention.
 
     Raises:
         InputError: r_cut + skin exceeds half the smallest perpendicular width of the box.
@@ -186,7 +187,7 @@ def check_radius(cell: Cell, r_cut: float, skin: float) -> None:
 
 @dataclass
 class VerletList:
-    """Builder of Verlet lists. It adds neighbor slots when needed."""
+    """Builder of Verlet lists. The builder adds neighbor slots when needed."""
 
     builder: ListBuilder  # the neighbor search
     rule: RebuildRule  # when to rebuild
@@ -199,7 +200,7 @@ class VerletList:
     slots: int = field(default=0)  # room per atom; 0 lets the density decide
 
     def build(self, positions: Float[np.ndarray | Array, "atoms 3"], cell: Cell) -> PairTable:
-        """Return the pairs closer than r_cut + skin. Positions must be wrapped.
+        """Return the pairs closer than r_cut + skin. Positions must be wrapped into the box.
 
         Raises:
             CapacityError: an atom would need more slots than there are other atoms.
@@ -238,7 +239,7 @@ class VerletList:
         return max(SLOTS, int(np.ceil(slots / SLOTS)) * SLOTS)
 
     def consumed(self, positions, cell: Cell, reference, reference_cell: Cell) -> float:
-        """Return the used fraction of the skin. Above 1, pairs may be missing.
+        """Return the used fraction of the skin. If it is above 1, pairs may be missing from the list.
 
         Args:
             positions, cell: present state. reference, reference_cell: state when the list was built.

@@ -1,8 +1,8 @@
 """Pair forces from a neighbor list that contains each pair twice.
 
 Every pair is evaluated twice, once for each atom. Each atom sums over its neighbors in a fixed order, without
-scattered writes. On a CPU in double precision, one compiled loop (`md.kernel`) computes the forces.
-Otherwise, XLA evaluates one group of neighbor slots at a time. Decisions are packed into bits, so that
+scattered writes. On a CPU in double precision, one compiled loop (`md.kernel`) computes the forces. On other
+devices, XLA evaluates one group of neighbor slots at a time. Decisions are packed into bits, so that
 temporary arrays fit in the cache. For 32,000 atoms, all slots at once would take ten times as long.
 """
 
@@ -117,7 +117,7 @@ class PairForce(eqx.Module):
 
     @property
     def _inside(self) -> str:
-        """Comparison (">" or ">=") of margin and 0 that means "inside the cutoff"."""
+        """Comparison (">" or ">=") of the margin with 0 that is true inside the cutoff."""
         return ">=" if self.decider.compare.endswith("<=") else ">"
 
     def _near(self, pair: Callable[..., Any], tensor: bool) -> kernel.Shortcut | None:
@@ -311,7 +311,7 @@ def factors(model: CutPotential, products: Iterable[Any]) -> list[tuple[Any, ...
 
 
 def _forces(sums: Sequence[Float[Array, "..."]], decisions: Decisions | None) -> Forces:
-    """Return forces from sums that count every pair for both atoms."""
+    """Return forces from sums that count every pair for both of its atoms."""
     fx, fy, fz, energy, *virial = sums
     half = jnp.asarray(0.5, energy.dtype)
     summed = [-jnp.sum(half * one, dtype=jnp.float64) for one in virial]
@@ -321,7 +321,7 @@ def _forces(sums: Sequence[Float[Array, "..."]], decisions: Decisions | None) ->
 
 @eqx.filter_custom_jvp
 def _in_one_loop(force: PairForce, positions, tables: Tables, given, where, *, decisions: bool, tensor: bool):
-    """Compute forces in one compiled loop. None if the loop cannot be used."""
+    """Compute pair forces in one compiled loop. Return None if the compiled loop cannot be used."""
     terms_of = force._terms(False)
 
     def pair(own, other, types, *bits, near=False):
@@ -353,7 +353,7 @@ def _in_one_loop(force: PairForce, positions, tables: Tables, given, where, *, d
 
 
 def _virial(made: kernel.PairSums, x: Float[Array, "3 atoms"]) -> list[Float[Array, ""]]:
-    """Return the sum of force times displacement over all pairs, in Voigt order. Pairs count twice.
+    """Return the sum of force times displacement over all pairs, in Voigt order. Each pair counts twice.
 
     The displacement of a pair is x_j - x_i minus lattice vectors. The virial sums force times position over
     atoms. For pairs across a boundary, the loop adds force times lattice vectors.
@@ -375,10 +375,10 @@ def _in_one_loop_jvp(primals, tangents, *, decisions: bool, tensor: bool):
 def imposed(
     inside: Bool[Array, "4 atoms"], given: UInt8[Array, "atoms"], where: UInt8[Array, "atoms"] | None
 ) -> Bool[Array, "4 atoms"]:
-    """Return imposed decisions where given, otherwise the computed decisions (`inside`).
+    """Return imposed pair decisions where given, and computed decisions (`inside`) elsewhere.
 
-    With a simple mask, a step takes 2.2 times as long as without imposed decisions. This code takes 1.2 times
-    as long.
+    With a simple mask, a step takes 2.2 times as long as without imposed decisions. With this function, a
+    step takes 1.2 times as long.
 
     Args:
         where: slots in which decisions are imposed; None for all.
@@ -461,7 +461,7 @@ class ManyBodyForce(eqx.Module):
         given: UInt8[Array, "words atoms"] | None = None,
         where: UInt8[Array, "words atoms"] | None = None,
     ) -> Forces:
-        """Return forces as `PairForce` does. The first atom has the total energy."""
+        """Return forces as `PairForce` does. The total energy is assigned to the first atom."""
         made = self.decide(positions, tables)
         bits = made.bits if given is None else given
         if given is not None and where is not None:
@@ -551,8 +551,8 @@ class MdState(NamedTuple):
 class PairDynamics(eqx.Module):
     """Dynamics on a fixed neighbor list with imposed decisions.
 
-    It is used to replay decisions, and for gradients at fixed decisions. A normal run makes the same steps in
-    compiled blocks.
+    The class is used to replay decisions, and for gradients at fixed decisions. A normal run makes the same
+    time steps in compiled blocks.
     """
 
     force: PairForce  # the pair force
@@ -577,7 +577,7 @@ class PairDynamics(eqx.Module):
         return self.force.decide(state.x, self.tables).bits
 
     def step(self, state: MdState, decisions: UInt8[Array, "words atoms"]) -> MdState:
-        """Make one time step with the given pair decisions."""
+        """Make one time step with the given decisions on pairs."""
         made = self.force(state.x, self.tables, decisions=False, given=decisions)
         order, cell = self.tables.order, self.force.cell
         end = one_step(self.integrator, cell, self.masses, order, *state, made)

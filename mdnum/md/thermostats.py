@@ -1,8 +1,8 @@
 """Thermostats that scale all velocities by one factor (Nosé-Hoover chains, stochastic rescaling).
 
-A total momentum of zero stays zero. Then three degrees of freedom are lost (`Integrator.freedom`). The
-variables of a thermostat are always float64. Velocities are scaled in float64, too. A factor rounded to
-float32 would give all atoms the same relative error.
+If the total momentum is zero, it stays zero. The system then has three fewer degrees of freedom
+(`Integrator.freedom`). The variables of a thermostat are always float64. Velocities are also scaled in
+float64. A factor rounded to float32 would give the velocities of all atoms the same relative error.
 """
 
 from __future__ import annotations

@@ -15,7 +15,7 @@ INCLUSIVE = {"<": False, "<=": True}
 
 @dataclass(frozen=True)
 class Threshold:
-    """A threshold and the operator that compares a quantity with it.
+    """A threshold, and the operator that compares a quantity with the threshold.
 
     The comparison is part of the physical model. Programs that compare r or r², by `<` or `<=`, can differ
     for pairs exactly at the cutoff.
@@ -32,10 +32,10 @@ class Threshold:
             raise InputError(f"comparison = {self.comparison!r}; expected one of {', '.join(INCLUSIVE)}")
 
     def margin(self, quantity):
-        """Return threshold minus quantity. It is positive if the decision is "yes".
+        """Return threshold minus quantity. The margin is positive if the decision is "yes".
 
-        The margin is exact within a factor of 2 of the threshold (Sterbenz lemma). The sign is always
-        correct, as unequal numbers never give zero.
+        The margin is exact for quantities within a factor of 2 of the threshold (Sterbenz lemma). The
+        margin's sign is always correct, as the difference of unequal numbers is never zero.
         """
         return self.value - quantity
 
@@ -46,11 +46,11 @@ class Threshold:
 
 @dataclass(frozen=True)
 class Hysteresis:
-    """A decision with hysteresis: two thresholds turn it on and off.
+    """A decision with hysteresis: two thresholds turn the decision on and off.
 
-    With one threshold, a fluctuating quantity flips the decision at each crossing. With two distant
-    thresholds, the decision flips only once. Similarly, a Verlet list is rebuilt only when its skin is used
-    up.
+    With one threshold, a fluctuating quantity flips the decision at each crossing. If the thresholds differ
+    by more than the fluctuation, the decision flips only once. Similarly, a Verlet list with a skin is not
+    rebuilt at every move.
     """
 
     enter: Threshold  # where a no turns yes
@@ -98,7 +98,7 @@ def _where(condition, yes, no):
 class Ledger:
     """Table of all flips of one kind of decision, sorted by step and labels.
 
-    At a flip, the decision differs from that of the previous step.
+    A flip at step s means that the decisions at s - 1 and s differ.
 
     Attributes:
         channel: name of the stream of decisions, for example "pair".

@@ -41,8 +41,8 @@ def _through_integers(x, zero):
 def fence(x: jax.Array, zero: jax.Array) -> jax.Array:
     """Return x. XLA cannot fuse the operations before and after.
 
-    The bits of x are combined (exclusive-or) with a zero unknown to XLA. This also forces rounding to float16
-    and bfloat16 on a CPU.
+    The bits of x are combined (exclusive-or) with a zero unknown to XLA. The fence also forces rounding to
+    float16 and bfloat16 on a CPU.
 
     XLA's optimization_barrier and reduce_precision do not prevent contraction (openxla/xla#41579).
     """
@@ -179,10 +179,10 @@ def _is_short(dtype: Any) -> bool:
 
 
 def enclosed(function: Callable[..., Any], arguments: int) -> Callable[..., list[Any]]:
-    """Return a float64 function in interval arithmetic. Intervals contain the exact value.
+    """Return a float64 function in interval arithmetic. Each interval contains the exact value.
 
     Constants of the formula are treated as exact float64 numbers. If both branches of a `where` are possible,
-    the result covers both.
+    the result covers both branches.
 
     Args:
         function: function of scalars; jax traces it once.

@@ -50,7 +50,7 @@ class FloatFormat:
 
     @property
     def smallest_subnormal(self) -> float:
-        """The smallest positive number. It is also the spacing of subnormal numbers."""
+        """The smallest positive number. The number is also the spacing of subnormal numbers."""
         return 2.0 ** (self.emin + 1 - self.significand)
 
 
@@ -90,10 +90,10 @@ def _identity_slope_jvp(primals, tangents):
 def round_to(
     x: Float[Array, "..."], name: str, whole: Callable[[Array], Array] = jnp.rint
 ) -> Float[Array, "..."]:
-    """Round x to the nearest number of a format, in the dtype of x. Ties go to even.
+    """Round x to the nearest number of a format, in the dtype of x. Ties are rounded to the even number.
 
-    Subnormal numbers are kept (unlike in `lax.reduce_precision`). Larger numbers become infinite. A float64
-    number is rounded once, whereas a cast may round twice. The derivative is 1.
+    Subnormal numbers are kept (unlike in `lax.reduce_precision`). Numbers beyond the format's range become
+    infinite. A float64 number is rounded once, whereas a cast may round twice. The derivative is 1.
 
     Args:
         x: float64 or narrower.
@@ -117,10 +117,10 @@ def round_to(
 def stochastic_round(x: Float[Array, "..."], name: str, key: Array) -> Float[Array, "..."]:
     """Round x at random to one of its two neighbors in a format.
 
-    The result has the dtype of x. Numbers of the format are unchanged. In its range, the expected value is x.
-    The standard deviation is at most half the spacing of numbers. A long sum of small terms therefore does
-    not stagnate. The random numbers have 53 bits. The derivative of the result with respect to x is defined
-    as 1. Source: Croci et al., R. Soc. Open Sci. 9, 211631 (2022).
+    The result has the dtype of x. Numbers that the format can represent are unchanged. In the range of the
+    format, the expected value is x. The standard deviation is at most half the spacing of numbers. A long sum
+    of small terms therefore does not stagnate. The random numbers have 53 bits. The derivative of the result
+    with respect to x is defined as 1. Source: Croci et al., R. Soc. Open Sci. 9, 211631 (2022).
     """
 
     def up_or_down(places: Array) -> Array:

@@ -1,8 +1,8 @@
 """Differences of floats in ulps, and rounding errors of pair distances.
 
-A displacement is x_j - x_i minus at most one lattice vector per periodic axis. Its squared components are
-added in the order x, y, z. The error of a rounding is proportional to the magnitude of its result. The class
-`Reach` bounds the results' magnitudes.
+A displacement is x_j - x_i minus at most one lattice vector per periodic axis. The squared components of the
+displacement are added in the order x, y, z. The error of a rounding is proportional to the magnitude of its
+result. The class `Reach` bounds the results' magnitudes.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ def ordinal(x: ArrayLike) -> Int[np.ndarray, "..."]:
 
 
 def neighbor(x, ulps: int, dtype: DTypeLike = np.float64):
-    """Return the float `ulps` places above x. Negative numbers mean below."""
+    """Return the float that is `ulps` floats above x. Negative `ulps` mean a float below x."""
     x = np.asarray(x, dtype)
     integer = _signed(x.dtype)
     place = ordinal(x) + ulps
@@ -79,7 +79,7 @@ class Reach:
         """Return the sum of |components| of all rounded results by axis, and their number.
 
         The first subtraction gives d + n_1 a_1 + n_2 a_2 + n_3 a_3, with final value d and n in {-1, 0, 1}.
-        Each further subtraction removes one term n_k a_k.
+        Each further subtraction of a lattice vector removes one term n_k a_k.
         """
         sizes, most = np.zeros(3), 1
         for axis in range(3):
@@ -105,10 +105,11 @@ def displacement_bound(
 ):
     """Return a bound on the error (a length) of a computed displacement.
 
-    Each rounding adds at most the unit roundoff times its result. If `dtype` has fewer digits than the state,
-    positions are first rounded. If `dtype` has fewer digits than float64, lattice vectors are rounded, too.
-    The exact displacement follows from the state and the system file. The nearest image found in `dtype`
-    must be the true nearest image. Therefore, half the box width must exceed r_cut by more than the error.
+    Each rounding adds at most the unit roundoff times the rounded result. If `dtype` has fewer digits than
+    the state, positions are first rounded. If `dtype` has fewer digits than float64, lattice vectors are also
+    rounded. The exact displacement follows from the state and the system file. The nearest image found in
+    `dtype` must be the true nearest image. Half the box width must exceed r_cut by more than the error of a
+    distance.
 
     Args:
         r: length(s) of the displacement.

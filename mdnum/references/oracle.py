@@ -51,9 +51,9 @@ def rounding_bound(
 ) -> float:
     """Upper bound on the rounding error (a length) of a distance close to r_cut.
 
-    It applies to codes that wrap coordinates, add a lattice vector, subtract and take the norm. Numbers are
-    at most coordinates plus cell. Each operation rounds once or twice. Typical rounding errors are a tenth of
-    this bound.
+    The bound applies to codes that wrap coordinates, add a lattice vector, subtract and take the norm.
+    Numbers are at most as large as coordinates plus cell. Each operation of the code rounds once or twice.
+    Typical rounding errors are a tenth of this bound.
 
     Args:
         positions: coordinates as passed to the code.
@@ -69,9 +69,9 @@ def rounding_bound(
 def exactly_inside(
     positions: Positions, cell: Vectors, i: int, j: int, shift: Shift, r_cut: float, *, closed: bool = False
 ) -> bool:
-    """Decide exactly whether a pair is inside r_cut. If `closed`, r == r_cut is inside.
+    """Decide exactly whether a pair is inside r_cut. If `closed` is True, r == r_cut counts as inside.
 
-    With rounding, r < r_cut and r² < r_cut² may differ.
+    With rounding, r < r_cut and r² < r_cut² may give different decisions.
     """
     squared, threshold = Fraction(0), Fraction(float(r_cut)) ** 2
     for axis in range(3):
@@ -91,7 +91,7 @@ def all_pairs(
     closed: bool = False,
     reach: float | None = None,
 ) -> PairSet:
-    """Find every pair within `reach`. Decide exactly whether it is inside r_cut.
+    """Find every pair within `reach`. Decide exactly whether each pair is inside r_cut.
 
     All pairs and all relevant lattice vectors are tested, without cell list or skin. Triclinic cells, partial
     periodicity, atoms outside the cell, and small cells are allowed. A small cell has several images of a

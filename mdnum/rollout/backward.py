@@ -1,6 +1,6 @@
 """Exact time reversal of a run with an integer state.
 
-A step is reversed by subtracting the integers that it added. All states of the forward run are therefore
+A step is reversed by subtracting the integers that the step added. All states of the forward run are
 recovered bit for bit. The neighbor lists may differ, because integer sums do not depend on order.
 """
 
@@ -176,7 +176,7 @@ class BackwardRun:
         self._check_bath()
 
     def _change_bath(self) -> None:
-        """Restore the thermostat's bath (bits removed by friction) at steps that emptied it."""
+        """Restore the thermostat's bath (bits removed by friction) at steps that emptied the bath."""
         step, period = int(self.back.step), self.simulation.propagator.pause
         if period is None or step % int(period):
             return
@@ -186,7 +186,7 @@ class BackwardRun:
         self.back = self.back._replace(extra=ByAtom(jnp.asarray(self.baths[step])))
 
     def _check_bath(self) -> None:
-        """Raise `NumericalError` if the bath is not zero at the step that emptied it."""
+        """Raise `NumericalError` if the bath is not zero at the step that emptied the bath."""
         if any(np.any(np.asarray(part)) for part in jax.tree.leaves(self.back.extra)):
             step = max(int(self.back.step), 0)
             raise NumericalError(

@@ -17,7 +17,7 @@ from mdnum.md.neighbors import PairTable
 
 @dataclass(frozen=True)
 class ReferenceFrame:
-    """Mapping of labels and axes of one run to those of another."""
+    """Mapping of atom labels and axes of one run to those of another run."""
 
     labels: Int[np.ndarray, "atoms"]  # atom b of this run is atom labels[b] of the other, shape (atoms,)
     axes: Int[np.ndarray, "3"]  # axis a of the other run is axis axes[a] of this one, shape (3,)
@@ -86,11 +86,11 @@ class ReferenceFrame:
         return out
 
     def keys(self, own: Int[np.ndarray, "pairs"]) -> Int[np.ndarray, "pairs"]:
-        """Convert keys of pairs to the other run's labels, sorted."""
+        """Convert keys of pairs to the labels of the other run, and sort the keys."""
         return np.sort(self.keys_of(*np.divmod(own, len(self.labels))))
 
     def keys_of(self, i: Int[np.ndarray, "pairs"], j: Int[np.ndarray, "pairs"]) -> Int[np.ndarray, "pairs"]:
-        """Return keys of pairs i, j in the other run's labels."""
+        """Return keys of pairs i, j with the labels of the other run."""
         atoms = len(self.labels)
         channel, i = np.divmod(i, atoms)
         a, b = self.labels[i], self.labels[j]
@@ -329,7 +329,7 @@ def overridden(
     species: Int[np.ndarray, "atoms"],
     r_cut: Float[np.ndarray, "channels species species"],
 ) -> tuple[Int[np.ndarray, "rows"], Float[np.ndarray, "rows"]]:
-    """Return the number of differing pairs, and their largest |r - r_cut|.
+    """Return the number of pairs with different decisions, and their largest |r - r_cut|.
 
     Args:
         cells: as for `separations`.

@@ -118,7 +118,7 @@ class EpochState(NamedTuple):
 
 
 class StepInputs(NamedTuple):
-    """Inputs of a time step that only its derivatives need."""
+    """Inputs of a time step that are needed only for derivatives."""
 
     v: Float[Array, "3 atoms"]  # velocities that lead there, as the step before left them
     extra: Any  # the extra state then
@@ -188,7 +188,7 @@ def empty_record(
     cells: bool = False,
     inputs: Any = (),
 ) -> EpochRecord:
-    """Allocate the record of an epoch. Without `record`, arrays of atoms are empty.
+    """Allocate the record of an epoch. If `record` is False, arrays with one entry per atom are empty.
 
     Args:
         changes: number of changes of decisions to allocate in place of rows of decisions and positions.

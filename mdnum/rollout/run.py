@@ -131,7 +131,7 @@ class Rollout:
         self.recorder = PairRecorder(self.simulation, saved.get("held"))
 
     def run(self) -> dict[str, Any]:
-        """Run to the last step, write all files, and return the summary. No report is made.
+        """Run to the last step, write all files, and return the summary. The report page is not written.
 
         Raises:
             NumericalError: a number is no longer finite; all results up to the previous step are kept.

@@ -1,7 +1,7 @@
 """The file answers.json, from which a killed command can be resumed.
 
 A command with many tests (`audit`, `conform`) keeps options and results in one dataclass. Important results
-are written at once, others about once per second. A resumed command restores all values, and runs the
+are written at once, other results about once per second. A resumed command restores all values, and runs the
 remaining tests. The tables in the command's folder are created from the stored results.
 """
 
@@ -45,7 +45,7 @@ class Answers(Generic[T]):
         self._before, self._began, self._due = state.seconds, monotonic(), 0.0
 
     def save(self, urgent: bool = True) -> None:
-        """Save the state for resuming the command. Without `urgent`, about once per second."""
+        """Save the state for resuming the command. Unless `urgent`, save about once per second."""
         now = monotonic()
         self.state.seconds = self._before + now - self._began
         if urgent or now >= self._due:
@@ -56,7 +56,7 @@ class Answers(Generic[T]):
 
 
 def take(path: str | Path, layout: Layout) -> RunFolder:
-    """Open the folder of a command to resume. Other processes cannot write into it.
+    """Open the folder of a command to resume. Other processes cannot write into the opened folder.
 
     Raises:
         FolderError: the folder has no state of this command, another process writes it, or it was changed.

@@ -222,7 +222,7 @@ def _advice(
     compared: Mapping[tuple[str, ...], Difference],
     results: _Results,
 ) -> list[dict[str, Any]]:
-    """Return the recommended value of each choice. Choices in `FREE` get the fastest."""
+    """Return the recommended value of each choice. Choices in `FREE` get the value with the fastest runs."""
     physical = {measure.name for measure in plan.measures if measure.physical}
     moving = {(key, value) for (name, key, value), one in compared.items() if one.moves and name in physical}
     rows = []
@@ -256,7 +256,7 @@ def _advice(
 def recommended(plan: Plan, advice: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
     """Return the settings of all recommended and all converged values. Empty if equal.
 
-    These settings show the combined effect of choices that were varied alone.
+    The two settings show the combined effect of choices that were varied alone.
     """
     best = {row["choice"]: row["best"] for row in advice if row["best"] is not None}
     ends = {row["choice"]: row["end"] for row in advice if row["end"] is not None}

@@ -77,7 +77,7 @@ def parse(text: str) -> Axis:
 
 
 def checked(axis: Axis) -> Axis:
-    """Return an axis unchanged. Raise an error if its values are invalid.
+    """Return an axis unchanged. Raise an error if the values of the axis are invalid.
 
     Raises:
         InputError: there are no values, a value is not finite, or values are repeated.

@@ -1,8 +1,8 @@
 """Analysis of flips as an MDAnalysis class, `NeighborFlips(universe, r_cut=8.5).run().results.flips`.
 
 Frames may be distributed over processes. Each process also reads the frame before its first frame. The
-results are therefore bitwise those of a single process. An error is raised if two processes differ at this
-frame.
+results are bitwise those of a single process. An error is raised if two processes find different pairs at the
+same frame.
 """
 
 from __future__ import annotations
@@ -85,7 +85,7 @@ class _ProcessPart:
 
 @dataclass
 class _Guarded:
-    """Iterator over frames. Each is checked before MDAnalysis reads it."""
+    """Iterator over frames. Each frame is checked before MDAnalysis reads the frame."""
 
     analysis: NeighborFlips
     numbers: np.ndarray
@@ -104,11 +104,12 @@ class NeighborFlips(AnalysisBase):
     With one rule, `results` has the attributes of `RuleResult` (`flips`, `pairs`, `near`, `min_margin`,
     `initial`, `last`, `contacts`, `occupancy`). With several rules, each element of `results.rules` is a
     `RuleResult`. Tables have a method `to_pandas()`. With by="residue", the pairs are pairs of residues. `i`
-    and `j` are row numbers of `results.residues`. `results.left_out` counts excluded atoms.
+    and `j` are row numbers of `results.residues`. `results.left_out` counts the excluded atoms.
     `results.resolution` is the resolution of positions in the file. `results.bound` contains the error bound
     of a distance in each frame. `results.repeats` lists the frames that repeat earlier frames (see
-    `repeats.RepeatedFrames`). `results.other_box` is another possible first box (see `Trajectory.other_box`),
-    or None. `frames` and `times` list the analyzed frames. `FlipTable.frame` is an index into both.
+    `repeats.RepeatedFrames`). `results.other_box` is another possible box of the first frame (see
+    `Trajectory.other_box`), or None. `frames` and `times` list the analyzed frames. `FlipTable.frame` is an
+    index into `frames` and `times`.
 
     An error names the frame that cannot be read or is impossible. The results of all earlier frames are kept.
 
@@ -414,7 +415,7 @@ def _joined(rule: Rule, parts: Sequence[_ProcessPart]) -> RuleResult:
 
 
 def _group_of(atoms: Any, name: str) -> AtomGroup:
-    """Return the atom group. Reject empty groups, and groups that change."""
+    """Return the atom group. Reject empty groups, and groups that change between frames."""
     if isinstance(atoms, UpdatingAtomGroup):
         raise InputError(
             f"the group {name} changes from frame to frame, so pairs that leave the group would be counted "

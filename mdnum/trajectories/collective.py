@@ -1,6 +1,6 @@
 """Detection of damaged files by an impossible motion of all atoms.
 
-A counter overflow makes a coordinate equal for all atoms. A wrong offset shifts all atoms. Planar systems,
+A counter overflow makes a coordinate equal for all atoms. A misread offset shifts all atoms. Planar systems,
 linear systems, drift and wrapping are not reported as damage.
 """
 

@@ -202,7 +202,7 @@ def far_out(
 ) -> tuple[int, int, str] | None:
     """Return the atom farthest from the others if this is impossible (arguments as in `FrameCheck`).
 
-    The previous frame also gives the system size, since this frame may be damaged.
+    The previous frame also gives the system size, since the current frame may be damaged.
 
     Returns:
         (the atom, the number of impossibly distant atoms, the reason in words), or None.

@@ -6,7 +6,7 @@ and a reduced vectors. A decision does not depend on the search algorithm.
 
 For a search, the reduced box is divided into bins. Along a nonperiodic direction, the number of bins is
 limited. For each bin, the atoms of all nearby bins and their images are gathered. Each atom of the bin is
-compared with these atoms.
+compared with the gathered atoms.
 """
 
 from __future__ import annotations
@@ -116,7 +116,7 @@ def shortest(
 
 
 def own_images(lattice: ReducedLattice, radius: float) -> Float[np.ndarray, "images"]:
-    """Return squared lengths of lattice vectors up to `radius`. Opposite vectors count once."""
+    """Return squared lengths of lattice vectors up to `radius`. Opposite vectors are counted once."""
     if not lattice.periodic.any() or radius < lattice.narrowest * (1 - 1e-9):
         return np.zeros(0)
     vectors, most = lattice.vectors, np.where(lattice.periodic, radius / lattice.widths + 1, 0).astype(int)
@@ -174,7 +174,8 @@ def near_squares(x, i, j, lattice, y, squares):
 def image_square(x, i, j, rank, lattice):
     """Return the squared distance from i to an image of j. `rank` counts nearer images.
 
-    Either i < j, or i == j (opposite images count once). If no image of j has this rank, the result is inf.
+    Either i < j, or i == j (opposite images count once). If no image of j has the given rank, the result is
+    inf.
     """
     vectors, periodic, widths = lattice.vectors, lattice.periodic, lattice.widths
     # the image that rounding names; nearest where that is near enough
@@ -245,7 +246,7 @@ class Participants:
 
     @property
     def both(self) -> Bool[np.ndarray, "atoms"]:
-        """True for atoms in both groups."""
+        """True for atoms that belong to both groups."""
         return self.centers & self.others
 
     @cached_property
@@ -443,7 +444,7 @@ def _run(d0, d1, d2, b0, b1, b2, bins, last):
 
 @njit
 def _most_around(bins, reach, start):
-    """Return the largest possible number of atoms and rows near one bin."""
+    """Return upper limits of the numbers of atoms and rows of bins near one bin."""
     atoms, runs = 0, 0
     for b0 in range(bins[0]):
         for b1 in range(bins[1]):
@@ -483,8 +484,8 @@ def _within(near, first, last, x0, x1, x2, largest, squares, flags, chosen):
 def meet(atoms, limits, found):
     """Record neighbor pairs. Return the numbers of decided and undecided pairs.
 
-    Within one group, half of the bins around each bin are examined. For two groups, all bins are examined.
-    Pairs found twice count once.
+    Within one group, half of the bins around each bin are examined. For two groups, all bins around a center
+    are examined. A pair of atoms that is found twice counts once.
     """
     written, left = 0, 0
     start, bins, reach, species = atoms.start, atoms.bins, atoms.reach, atoms.species

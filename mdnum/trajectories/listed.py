@@ -91,7 +91,7 @@ class GivenList(NamedTuple):
         return cls(shifted, full, np.searchsorted(i, np.arange(atoms + 1, dtype=i.dtype)), i, j, image)
 
     def has(self, i: np.ndarray, j: np.ndarray, image: np.ndarray) -> Bool[np.ndarray, "pairs"]:
-        """Return True for each pair in the list. Sorted i are fastest."""
+        """Return True for each given pair that the list contains. The search is fastest if i is sorted."""
         return _has(self.first, self.j, self.image, i, j, image, self.shifted)
 
     def missing(self, frame: Frame, pairs: Members) -> Int[np.ndarray, "pairs"]:
@@ -181,7 +181,7 @@ class ListCheck:
         self._open: dict[tuple[int, int, int], tuple[int, int, int, float]] = {}
 
     def given(self, neighbors: Any, species: np.ndarray) -> GivenList:
-        """Return the list as a `GivenList`. An unchanged list gives the same object."""
+        """Return the list as a `GivenList`. If the list is unchanged, the same object is returned."""
         if self._newest is None:
             if self._rule.directed:
                 message = f"a neighbor list needs a cutoff, but the rule is {self._rule.name}"
@@ -206,7 +206,7 @@ class ListCheck:
         flips: Mapping[str, np.ndarray],
         now: GivenList,
     ) -> tuple[dict[str, Any], list[dict[str, Any]]]:
-        """Compare a list with the true pairs. Return (results, rows of pairs that were missing).
+        """Compare a list with the pairs inside the cutoff. Return (results, rows of pairs that were missing).
 
         Args:
             at: index of the frame among the frames examined.
@@ -249,7 +249,7 @@ class ListCheck:
         return row, self.ended(at, tracker.bound, {key: known[key] for key in gone})
 
     def _drops(self, earlier: GivenList, now: GivenList, frame: Frame, before: Frame, placed: Placed) -> bool:
-        """Return True if the list may lack pairs that it contained before."""
+        """Return True if the list may lack pairs that the previous list contained."""
         i, j, image, reach = earlier.i, earlier.j, earlier.image, self._rule.reach
         x, (matrix, inverse) = placed.positions, cell_of(frame)
         if (earlier.shifted, earlier.full) != (now.shifted, now.full):

@@ -1,4 +1,4 @@
-"""Contacts between residues: a pair of their atoms is within the cutoff.
+"""Two residues are in contact if a pair of their atoms is within the cutoff.
 
 Decisions are made for pairs of atoms. The stored distance of two residues is the smallest distance between
 their atoms. Hydrogens and virtual sites are excluded by default, as their positions depend on constraints.
@@ -45,7 +45,7 @@ class ByResidue:
 
     @classmethod
     def make(cls, table: AtomTable, groups: Groups, hydrogens: bool, rules: Sequence[Rule]) -> ByResidue:
-        """Build the residues of a file. `hydrogens` includes hydrogens and virtual sites.
+        """Build the residues of a file. If `hydrogens` is True, hydrogens and virtual sites are included.
 
         Raises:
             InputError: the file has no residues, no atom is left, or a rule is not defined for pairs of
@@ -105,7 +105,7 @@ class ResidueTracker:
     """Tracker of contacts between residues, used like `Tracker`.
 
     Pairs of atoms within one residue are ignored. `near` counts atom pairs at the cutoff, within rounding.
-    Two residues may have several. The attribute `min_margin` is always inf.
+    Two residues may have several such pairs. The attribute `min_margin` is always inf.
 
     Args:
         rule: membership rule for atoms.

@@ -119,7 +119,7 @@ def search(
 def exact_square(x, home, i, j, n0, n1, n2, vectors):
     """Return the squared distance that is compared with the threshold. n is the image of j.
 
-    The squared distance has the same bits if atoms are exchanged.
+    The squared distance has the same bits if i and j are exchanged.
     """
     s0, s1, s2 = n0 + home[i, 0] - home[j, 0], n1 + home[i, 1] - home[j, 1], n2 + home[i, 2] - home[j, 2]
     return square_of(x, i, j, s0, s1, s2, vectors)
@@ -381,7 +381,7 @@ def image_distances(
 ) -> Float[np.ndarray, "pairs"]:
     """Return the distance from i to an image of j. `rank` counts nearer images.
 
-    If there is no such image of j, the distance is inf. A directed rule counts opposite images separately.
+    If no such image of j exists, the distance is inf. A directed rule counts opposite images separately.
     """
     out = np.empty(len(i))
     rank = np.where(i == j, rank // 2, rank) if directed else rank

@@ -4,8 +4,8 @@ Three quantities describe the durations of contacts:
 
 - The **lifetime** is estimated from contacts whose beginning was observed. Contacts after the last frame are
   right-censored (Kaplan, Meier, J. American Statistical Association 53, 457, 1958).
-- The **mean by rate** is the contact time per observed contact end. It is the mean lifetime if contacts end
-  at a constant rate.
+- The **mean by rate** is the contact time per observed contact end. The mean by rate is the mean lifetime if
+  contacts end at a constant rate.
 - The **residence** is the fraction of pairs that stay in contact during a lag (Impey, Madden and McDonald, J.
   Phys. Chem. 87, 5071, 1983). Long contacts are sampled more often, so the residence differs from the
   lifetime.
@@ -115,7 +115,8 @@ def survival(found: Durations) -> Survival:
 def mean_by_rate(found: Durations) -> tuple[float, float]:
     """Return contact time per contact end (frames), and its error. inf if no contact ended.
 
-    The standard error assumes independent contact ends. Repeated crossings make it too small.
+    The standard error is valid for independent contact ends. Repeated crossings make the standard error too
+    small.
     """
     if not found.leaves:
         return float("inf"), float("nan")
@@ -126,8 +127,8 @@ def mean_by_rate(found: Durations) -> tuple[float, float]:
 def residence(found: Durations, pairs: Int[np.ndarray, "frames"]) -> Float[np.ndarray, "frames"]:
     """Return, by lag, the fraction of pairs that stay in contact without a break.
 
-    Lags begin at 0. Each fraction is an average over first frames. nan if there are no pairs. `pairs` is the
-    number of pairs inside the cutoff at each frame.
+    Lags begin at 0. Each fraction is an average over first frames. nan if no pair is in contact. `pairs` is
+    the number of pairs inside the cutoff at each frame.
     """
     count, lags = found.all, np.arange(len(pairs))
     stays = np.cumsum(count[::-1])[::-1]
@@ -376,7 +377,7 @@ class Statistics(Sums):
         """Add statistics of `history` to `before`. Return the sum and the contacts.
 
         A flip reversed within `window` frames is counted as chatter. A contact with a gap of up to `window`
-        frames counts as one.
+        frames counts as one contact.
         """
         frames, stays = history.frames, contacts(history)
         named, residues = labels.residue_names, labels.residues
@@ -404,7 +405,7 @@ class Statistics(Sums):
         return counted if before is None else before + counted, stays
 
     def curves(self, pairs: Int[np.ndarray, "frames"], interval: float) -> dict[str, np.ndarray]:
-        """Return survival and residence by lag. `pairs` counts contacts at each frame.
+        """Return survival and residence by lag. `pairs` is the number of contacts at each frame.
 
         `interval` is the time between frames, nan if unknown.
         """

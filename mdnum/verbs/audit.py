@@ -62,7 +62,7 @@ def audit(
 ) -> Outcome:
     """Test whether a calculator is safe to run and to differentiate.
 
-    About 6,000 calculator calls are made for one element, at most 12,000. Calls of the calculator that are
+    The calculator is called about 6,000 times for one element, and at most 12,000 times. Calls that are
     needed for a verdict come first. An interrupted audit keeps the results of completed checks.
 
     Example:
@@ -219,7 +219,7 @@ def _ask_all(
 def answer_of(
     check: AuditCheck, subject: CalculatorSubject, log: frame.Progress, before: Iterable[CheckResult]
 ) -> CheckResult:
-    """Run a check and return its result. A failing calculator is a finding.
+    """Run a check and return its result. If the calculator fails, the result is a finding.
 
     Different results for the same input are reported once per audit.
     """
@@ -287,7 +287,7 @@ def _loaded(calculator: str | Callable[[], Any]) -> LoadedCalculator:
 
 
 def _same(calculator: str | Callable[[], Any] | None, state: AuditState, path: Path) -> LoadedCalculator:
-    """Return the calculator of an audit to resume. Raise an error for another one."""
+    """Return the calculator of an audit to resume. Raise an error if another calculator is given."""
     if calculator is None and not state.named:
         raise InputError(
             "the calculator of the stored audit was a Python object, which is not stored in the folder",

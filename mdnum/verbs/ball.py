@@ -199,7 +199,7 @@ def gradients(problem: BallProblem, asked: Any, first: bool = False) -> list[dic
 
 
 def loss(problem: BallProblem, gradient: Sequence[Mapping[str, Any]]) -> float:
-    """Return the loss. A gradient method may have computed it already."""
+    """Return the loss. A gradient method may have computed the loss already."""
     same = ("unrolled", "frozen", "event-aware")
     known = [made["value"] for made in gradient if made["method"] in same and not made["refused"]]
     return known[0] if known else problem.value()
@@ -209,7 +209,7 @@ def loss(problem: BallProblem, gradient: Sequence[Mapping[str, Any]]) -> float:
 
 
 def judge(view: BallView) -> Verdict:
-    """Return findings on a ball's run, and evidence that it is correct."""
+    """Return findings on a ball's run, and evidence that the run is correct."""
     summary = view.summary
     rules = (
         _finite, _ledger, _finite_gradient, _independent, _ambiguous, _cap, _disagree, _forks, _iterations,

@@ -77,8 +77,8 @@ def contacts(run: BallRun) -> dict[str, np.ndarray]:
 def decisions(run: BallRun) -> dict[str, np.ndarray]:
     """Return a table of the solver's stop decisions.
 
-    All decisions are included for one solver with residual histories. Otherwise, only the last two decisions
-    of each call are included.
+    All decisions are included for one solver with residual histories. If not, only the last two decisions of
+    each call are included.
     """
     rule = rule_of(run)
     if rule is None:
@@ -274,7 +274,7 @@ def rule_of(run: BallRun) -> Any:
 
 
 def solved(run: BallRun) -> np.ndarray:
-    """True for each step at which the solver was needed. By ball if balls are solved separately."""
+    """True for each step at which the solver was needed. With separate solvers, by ball."""
     if rule_of(run) is None:
         return run.reason != Reason.NONE.value
     if isinstance(run.world.contact, Penalty):
@@ -303,7 +303,7 @@ def ambiguous_stops(run: BallRun) -> np.ndarray:
 
 
 def _of_batch(run: BallRun) -> tuple[np.ndarray, np.ndarray]:
-    """Residual and stop margin of each step. With separate solvers, those of the smallest |margin|."""
+    """Residual and stop margin of each step. For separate solvers, take the ball with smallest |margin|."""
     residual, margin = run.residual.astype(np.float64), run.margin.astype(np.float64)
     if residual.ndim == 1:
         return residual, margin

@@ -269,7 +269,7 @@ def _time_goes_back(view: FlipsView) -> Finding:
 
 
 def _title(title: str, view: FlipsView, one: Rule) -> str:
-    """Return the title of a section. It names the rule if there are several."""
+    """Return the title of a section. The title names the rule if the analysis has several rules."""
     return f"{title}, {view.rule(one)}" if len(view.summary["rules"]) > 1 else title
 
 

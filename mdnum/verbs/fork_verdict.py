@@ -26,7 +26,7 @@ RANKING = "Ranking"
 
 
 def subject(s: Mapping[str, Any]) -> str:
-    """Return a phrase for a decision: a pair's flip, a contact or a stop."""
+    """Return a phrase for a decision: a pair's flip, a ball's contact or a solver's stop."""
     d = s.get("decision")
     if d is None:
         return ""

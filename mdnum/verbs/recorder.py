@@ -34,8 +34,9 @@ _NONE = {name: np.zeros(0, np.int64) for name in ("rule", "i", "j", "rank", "ent
 class Recorder:
     """Recorder of flips and of missing neighbors, for any simulation loop.
 
-    The results are those of `mdnum.flips` for a file of these frames. Pair decisions are computed from the
-    positions in float64. Decisions that are uncertain because positions were rounded to float32 are marked.
+    The results are the same as from `mdnum.flips` for a file of the recorded frames. Pair decisions are
+    computed from the positions in float64. Decisions that are uncertain because positions were rounded to
+    float32 are marked.
 
     Example:
         >>> with mdnum.Recorder(8.5, box=box, fractional=True, out="runs/mine") as rec:
@@ -272,7 +273,7 @@ class Recorder:
             self._cost = self._written - now
 
     def _after(self, one: FrameExamination, new: Sequence[dict[str, Any]]) -> None:
-        """Record a frame's energy, and pairs that its neighbor list lacks."""
+        """Record a frame's energy, and pairs that are missing from its neighbor list."""
         energy, listed, overflow = self._told.popleft()
         flips, frame = next((rows for rows in new if rows["rule"][0] == 0), _NONE), self._source.now
         for rows in new:

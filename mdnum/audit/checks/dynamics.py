@@ -51,8 +51,8 @@ class DynamicsCheck(AuditCheck):
     """Is the energy conserved in a short run at constant energy?
 
     The check reports the drift, its standard error, and the drifts due to integrator, flips and other causes.
-    Drift that neither flips nor the work of forces explain is the integrator's. At half the time step, it
-    must fall to a quarter.
+    Drift that neither flips nor the work of forces explain is the integrator's. At half the time step, the
+    integrator's drift must fall to a quarter.
     """
 
     name, title, order, basic, calls = "dynamics", "Dynamics", 70, True, 1900
@@ -187,7 +187,7 @@ class TwoRuns:
         return {name: share.times(factor) for name, share in found.items()}
 
     def outcome(self, unknown: str) -> CheckResult:
-        """Return the result of the check. `unknown` is why no thresholds are known."""
+        """Return the result of the check. `unknown` states why no pair thresholds are known."""
         shares = self.shares()
         numbers = self._numbers(shares)
         crossed, measured = len(self.balance.crossed), len(self.balance.measured)
@@ -360,7 +360,7 @@ class TwoRuns:
 
 
 class _Bridge(Calculator):
-    """An ASE calculator that calls another one, and saves structures on which it fails."""
+    """An ASE calculator that saves structures on which the audited calculator fails."""
 
     implemented_properties = ["energy", "forces"]  # noqa: RUF012
 
@@ -381,7 +381,7 @@ def prepared(
     period: float,
     rng: np.random.Generator,
 ) -> Atoms:
-    """Return a structure with thermal velocities. `period` is the fastest period."""
+    """Return a structure with thermal velocities. `period` is the period of the fastest vibration."""
     from ase import units
 
     # atoms at rest in their places take half of the kinetic energy into vibrations
@@ -464,8 +464,8 @@ def run(
 class RigidGroups:
     """ASE constraint that fixes all distances within groups, such as molecules.
 
-    ASE's class FixBondLengths treats one bond at a time in Python. For water, this class is a hundred
-    times faster.
+    ASE's class FixBondLengths treats one bond at a time in Python. For water, RigidGroups is a hundred times
+    faster.
 
     Source:
         H. C. Andersen, Rattle: a velocity version of the Shake algorithm, J. Comput. Phys. 52, 24 (1983).
@@ -518,7 +518,7 @@ class RigidGroups:
                 return
 
     def adjust_forces(self, atoms: Atoms, forces: Float[np.ndarray, "atoms 3"]) -> None:
-        """Leave the forces unchanged. The momenta are adjusted instead."""
+        """Leave the forces unchanged. Constrained runs adjust the momenta."""
 
     def todict(self) -> dict[str, Any]:
         """Return the constraint as a dictionary in ASE's format for constraints."""

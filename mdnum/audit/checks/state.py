@@ -36,7 +36,7 @@ class StateCheck(AuditCheck):
     needed_to = ("run",)
 
     def ask(self, subject: CalculatorSubject, progress: Progress) -> CheckResult:
-        """Compare one calculator object for all structures with new ones."""
+        """Compare one calculator object for all structures with one object per structure."""
         rng = np.random.default_rng(self.seed)
         with subject.meter.limited():
             atoms, noise = settled(subject.fresh(), rng, brief=self.brief)
@@ -153,7 +153,7 @@ class Comparison:
 
     @property
     def refused(self) -> CalculatorError | None:
-        """Error of the new calculator object, or else of the used one, or None."""
+        """Error of the new calculator object, or else of the used object, or None."""
         return next((one for one in (self.new, self.old) if isinstance(one, CalculatorError)), None)
 
     @property
@@ -169,7 +169,7 @@ class Comparison:
 
 
 def _approached(subject: CalculatorSubject) -> tuple[dict[str, list[SequenceStep]], Ways]:
-    """Return sequences in which two atoms come within the cutoff, or why there are none."""
+    """Return sequences in which two atoms come within the cutoff, or why no sequence exists."""
     what = "two atoms at the cutoff"
     try:
         thresholds = find_thresholds(subject)

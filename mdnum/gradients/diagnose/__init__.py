@@ -1,4 +1,4 @@
-"""Diagnose a gradient: up to which step it can be trusted, and why.
+"""Diagnose a gradient: up to which step it can be trusted, and what contributes to it.
 
 Gradient methods compute different quantities: derivatives of the time steps, derivatives that include changes
 of flip times, finite differences of the loss, finite differences of an ensemble average, or derivatives of
@@ -189,7 +189,7 @@ def _meaning(
     name: str, one: Gradient, reference: Gradient, size: float, relative: float, rounding: float,
     grown: float, jumps: bool,
 ) -> tuple[str, dict[str, float] | None]:  # fmt: skip
-    """Return why two derivatives differ, and numbers that show this (or None)."""
+    """Return why two derivatives differ, and numbers that show the reason (or None)."""
     kinds = {one.kind: one, reference.kind: reference}
     if not np.isfinite(relative):
         return "unexplained", {}

@@ -132,7 +132,7 @@ def once(
     r_cut: float = 1.0,
     known: PairSet | None = None,
 ) -> Case:
-    """Return a test case with one call. Without a cell, there is no box."""
+    """Return a test case with one call. Without a cell, the test case has no box."""
     if cell is None:
         cell, pbc = np.zeros((3, 3)), False
     return Case(name, area, (Still(positions, matrix(cell)),), _axes(pbc), float(r_cut), known=known)

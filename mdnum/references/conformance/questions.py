@@ -163,9 +163,9 @@ def _crowds() -> Named:
 
 
 def vast() -> Iterator[Case]:
-    """Yield test cases with a volume too large for a simple cell grid.
+    """Yield test cases whose volume is too large for a simple cell grid.
 
-    They run in a separate process, as a huge cell grid may kill it.
+    Cases with very large volume run in a separate process.
     """
     apart = np.array([[0.0, 0.0, 0.0], [0.5, 0.5, 0.5], [700.0, 2500.0, 2400.0], [700.5, 2500.0, 2400.0]])
     yield once("two pairs thousands of cutoffs apart, free", "axes", apart)
@@ -176,7 +176,7 @@ def vast() -> Iterator[Case]:
 def lattice(edge: int, seed: int = 0) -> Case:
     """Return atoms on a cubic lattice with vacancies, in random order and images.
 
-    The neighbors of each atom are on the 26 sites around it. Neighbors follow from site indices, without
+    The neighbors of each atom are on the 26 sites around it. Neighbors are found from site indices, without
     rounding.
 
     Args:
@@ -358,7 +358,7 @@ def plan(
 ) -> list[tuple[int, Iterable[Case]]]:
     """Return groups of test cases as tuples (number of cases, cases).
 
-    First come up to `BREADTH` named test cases of each area, then random and large ones.
+    First come up to `BREADTH` named test cases of each area, then random and large test cases.
 
     Args:
         count: number of random cases.
@@ -403,7 +403,7 @@ def as_kept(tested: PairList, asked: Iterable[Case]) -> Iterator[Case]:
 
 
 def drawn(count: int, seed: int) -> list[Case]:
-    """Return test cases drawn by hypothesis. A seed always gives the same cases."""
+    """Return test cases drawn by hypothesis. The same seed always gives the same test cases."""
     collected: list[Case] = []
     checks: Any = list(hypothesis.HealthCheck)
 

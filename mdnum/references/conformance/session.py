@@ -1,4 +1,4 @@
-"""Call a neighbor list, in this or another process. Return its pairs or errors."""
+"""Call a neighbor list, in this process or another one. Return its pairs or errors."""
 
 from __future__ import annotations
 
@@ -59,7 +59,7 @@ class CallOutcome:
 
 
 class Session:
-    """Calls a neighbor list. If `reuse` is True, all test cases use one list object."""
+    """Calls a neighbor list. If `reuse` is True, all test cases use one object of the neighbor list."""
 
     starts, deadline = 0, Deadline()  # of a process; calls in this one have none
 
@@ -245,7 +245,7 @@ def _value(name: ast.expr, place: TracebackType) -> Any:
 class RemoteSession:
     """Calls of one named neighbor list in a separate process.
 
-    A crash of the process is a finding. Then a new process is started.
+    A crash of the process is a finding. After a crash, a new process is started.
     """
 
     most = np.inf  # seconds that an answer may take, where that is less than usual
@@ -342,7 +342,7 @@ class _Ended(Exception):
 
 
 def _watch(process: Any, seconds: float, deadline: Deadline, done: threading.Event, late: list[str]) -> None:
-    """Kill a process after its time limit. Append to `late` whether it computed or waited."""
+    """Kill a process after its time limit. Append to `late` whether the process computed or waited."""
     began, used = time.monotonic(), _processor_seconds(process.pid)
     left = seconds
     while not done.wait(min(left, deadline.left)):

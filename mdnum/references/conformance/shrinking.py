@@ -130,8 +130,8 @@ def _simplifications(case: Case) -> Iterator[Callable[[Case], Case]]:
 def deepest(failures: Failures, failed: Failed) -> Failed:
     """Move the atoms of a missing pair closer while the list omits the pair.
 
-    All atoms move along their displacement between the first two calls. The failure then shows the smallest
-    distance of an omitted pair.
+    All atoms move along their displacement between the first two calls of the list. The failure then shows
+    the smallest distance of a pair that the list omits.
     """
     case = failed.case
     if failed.code != "MISSING" or case.area != "rule" or case.steps != 2 or not failed.alone:
@@ -148,7 +148,7 @@ def deepest(failures: Failures, failed: Failed) -> Failed:
 
 
 def reduced(examiner: Examiner, failed: Failed, before: tuple[Case, ...], deadline: Deadline) -> Failed:
-    """Reduce a failure, and run the script that reproduces it."""
+    """Reduce a failure, and run the script that reproduces the failure."""
 
     def failures(case: Case) -> Sequence[Failure]:
         with suppress(TimeUp):
