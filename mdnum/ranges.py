@@ -1,4 +1,4 @@
-"""Ranges of the numbers in a run, and too narrow floating-point formats."""
+"""Ranges of the numbers in a run, and floating-point formats that are too narrow."""
 
 from __future__ import annotations
 

@@ -45,7 +45,7 @@ def _answer(question: str, results: Sequence[CheckResult], wanted: Sequence[str]
 
 
 def largely_unasked(result: CheckResult) -> bool:
-    """Return whether a check ran out of time before most of its cases."""
+    """Return whether a check reached its time limit before most of its test cases."""
     return result.asked < _NEARLY * result.possible
 
 
@@ -59,7 +59,7 @@ def _begun(results: Sequence[CheckResult]) -> set[str]:
 
 
 def to_come(results: Sequence[CheckResult], wanted: Sequence[str]) -> bool:
-    """Return whether the verdict is open: no error yet, and a basic check has not run."""
+    """Return whether the audit has no verdict yet."""
     begun, basic = _begun(results), {name for name in wanted if CHECKS[name].basic}
     return "no" not in answers(results, wanted).values() and not (basic <= begun and begun)
 

@@ -1,7 +1,7 @@
 """Energy balance of a run: energy jumps, work of the forces, energy drift.
 
-If the force is minus the energy gradient, energy change plus work is zero in every step. An energy change
-without work at a distance threshold is the energy jump of a flip. An energy jump elsewhere is due to a limit
+If the force is minus the energy gradient, energy change plus work is zero in every step. An unexplained
+energy change at a distance threshold is the energy jump of a flip. An energy jump elsewhere is due to a limit
 on the number of neighbors or a selection of nearest neighbors. An unexplained change at many points means
 that the force is not minus the energy gradient.
 """
@@ -332,7 +332,7 @@ class EnergyBalance:
         return {threshold: float(np.mean(jumps)) for threshold, jumps in found.items()}
 
     def by_means(self, crossed: Sequence[RunCrossing], steps: int) -> Steps:
-        """Estimate the energy changes (eV) at flips of another run, from mean jumps."""
+        """Estimate the energy changes (eV) at flips of another run, from this run's mean jumps."""
         jumps, means = np.zeros(steps), self.means
         for one in crossed:
             jumps[one.step] += one.sign * means.get(one.threshold, 0.0)

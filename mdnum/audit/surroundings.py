@@ -419,7 +419,7 @@ def _crowded(subject: CalculatorSubject, walk: PairWalk, count: int, ties: int) 
     side = _SIDE_OF_TIE * float(np.spacing(np.float32(max(np.abs(atoms.positions).max(), radius))))
 
     def change(place: float, without: int | None = None) -> tuple[float, Float[np.ndarray, "atoms"]]:
-        """Return the jumps as an atom moves from `place - side` to `place + side`.
+        """Return the jumps of energy and forces as an atom moves from `place - side` to `place + side`.
 
         The energy jump is the energy change plus the work of the force. The force jump is the change of force
         minus the mean change of the two adjacent intervals. Both are absolute values.

@@ -101,7 +101,7 @@ class BallProgram:
             )
 
     def run(self, steps: int, decisions: BallDecisions | None = None) -> BallRun:
-        """Run the simulation. The balls are in the order of the other run.
+        """Run the simulation. The result has the balls in the order of the other run.
 
         Args:
             decisions: decisions imposed on the balls in that order; None for the program's own decisions and

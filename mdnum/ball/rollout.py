@@ -346,7 +346,7 @@ def cross_decisions(a: BallRun, b: BallRun, last: int | None = None) -> list[Cro
 
 
 def _stops(a: BallRun, b: BallRun, rows: int) -> list[CrossDecision]:
-    """List the steps with different numbers of solver iterations."""
+    """List the steps at which the solvers of two runs made different numbers of iterations."""
     row, ball = np.nonzero(_unequal_counts(a, b, rows))
     if a.iterations.ndim == b.iterations.ndim == 1:
         ball = np.full(len(row), -1)

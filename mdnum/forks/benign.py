@@ -5,7 +5,7 @@ errors can exceed the scatter of the ensemble. At late steps, no run depends on 
 The steps suitable for a comparison depend on the system. In the calibration, programs are deliberately
 changed. At the chosen step, all changes are distinguishable from rounding.
 
-The test follows those of climate models (Baker et al. 2015; Milroy et al. 2018). Measured quantities
+The test follows tests of climate models (Baker et al. 2015; Milroy et al. 2018). Measured quantities
 (features) are standardized and projected onto principal components of the ensemble. A run is an outlier if at
 least two of its components exceed the limit. A program fails the test if at least two of its three runs are
 outliers. In other words, the median of the second-largest component over its runs exceeds the limit.
@@ -120,7 +120,7 @@ def limit_of(features: Float[np.ndarray, "runs features"]) -> float:
 
 
 def triples(seconds: Float[np.ndarray, "runs"]) -> Float[np.ndarray, "tries"]:
-    """Return the median of the second-largest component for each three successive runs."""
+    """Return the median of the second-largest component for every three successive runs."""
     tries = len(seconds) // RUNS
     return np.median(seconds[: RUNS * tries].reshape(tries, RUNS), axis=1)
 
@@ -322,7 +322,7 @@ def _windows(simulation: Simulation, start: Start | None) -> list[int]:
 
 @result
 class Benign:
-    """Whether runs of program B agree statistically with runs of program A."""
+    """Result of a test whether program B agrees statistically with program A."""
 
     passed: bool  # whether they do
     window: int  # step of the comparison

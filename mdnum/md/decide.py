@@ -1,4 +1,4 @@
-"""Decisions which pairs are inside the cutoff.
+"""The rule that decides which pairs are inside the cutoff.
 
 Only this module defines the compared quantity and its threshold. The force loop, the check of neighbor lists
 and the ledger therefore make the same decisions.

@@ -236,7 +236,7 @@ class Integrator(eqx.Module):
     def exchanged(self, extra: Any, at: AtStep) -> tuple[Number | float, Number | float]:
         """Return the heat from the thermostat and the work of the box, so far.
 
-        Total energy minus heat, work and the heat from `begin` is conserved.
+        The total energy minus this heat and work, and minus the heat from `begin`, is conserved.
         """
         return 0.0, 0.0
 
@@ -299,7 +299,7 @@ def one_step(
 
 
 class KickDrift(Integrator):
-    """Base class of integrators with a kick by the forces and a drift independent of them.
+    """Base class of integrators with a kick by the forces and a drift without forces.
 
     Example:
         >>> isinstance(mdnum.build("argon/langevin-500").integrator, mdnum.KickDrift)

@@ -274,7 +274,7 @@ class Conservation:
 
 
 def range_table(label: Callable[[str], str], *tables: Mapping[str, np.ndarray]) -> Table:
-    """Tabulate the ranges of quantities, and when they leave narrower float formats.
+    """Tabulate the ranges of quantities, and the first steps outside narrower float formats.
 
     Args:
         label: function that returns the label of a quantity from its name.

@@ -188,7 +188,7 @@ def summarize(simulation: Simulation, done: Any, steps: int, status: str) -> dic
 
 
 def closest_pair(simulation: Simulation, positions: Float[np.ndarray, "atoms 3"]) -> str:
-    """Return a phrase about the closest two atoms, for the error of a blow-up."""
+    """Return a phrase about the closest two atoms, for the error message of a blow-up."""
     if simulation.atoms < 2 or not np.all(np.isfinite(positions)):
         return ""
     wrapped, _ = wrap_positions(simulation.cell, positions)
@@ -293,7 +293,7 @@ _NOISES = 20.0
 
 @dataclass
 class EnergyBudget:
-    """Check of the recorded energy jumps against energies without neighbor lists."""
+    """Check of the recorded energy jumps against energies computed without neighbor lists."""
 
     simulation: Simulation  # the system as objects
     start: float | None = None  # hard energy minus reference energy at step 0, or None before it was seen

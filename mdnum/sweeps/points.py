@@ -53,7 +53,7 @@ _ARITHMETIC = ("jax", "jaxlib", "numpy", "llvmlite")
 
 @cache
 def code(everywhere: bool = False) -> str:
-    """Return a digest of the source code of points, and of the versions of numerical packages.
+    """Return a digest of the source code that computes points, and of the versions of numerical packages.
 
     Args:
         everywhere: whether to include all source code of mdnum.
@@ -150,7 +150,7 @@ class Workspace:
             ) from None
 
     def nearest(self, point: Mapping[str, Any]) -> list[str] | None:
-        """Return the fields in which a point differs from the nearest stored point, or None."""
+        """Return the fields in which a point differs from the most similar stored point, or None."""
         best: list[str] | None = None
         for file in self.place.glob(f"*/{STATE_POINT}"):
             with suppress(OSError, ValueError):

@@ -268,7 +268,7 @@ def _time_factors(trajectory: Any) -> tuple[float, float]:
 
 
 def left_over(trajectory: Any) -> str | None:
-    """Describe data after the last frame of MDAnalysis. None if there are no data.
+    """Describe data after the last frame that MDAnalysis reads. None if there are no data.
 
     In line-based text, the MDAnalysis reader is moved to its last frame.
     """

@@ -290,7 +290,7 @@ def _not_run(
     asked: int | None, problem: Problem, found: GradientDiagnosis, replicas: int,
     further: Sequence[str], half_step: bool,
 ) -> list[dict[str, str]]:  # fmt: skip
-    """Return the results that were not computed, with reason and option."""
+    """Return the results that were not computed, each with its reason and option."""
     from mdnum.gradients.diagnose.trust import no_half_step
 
     own, rows = problem.simulation.steps, []

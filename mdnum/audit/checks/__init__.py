@@ -1,4 +1,4 @@
-"""Registry of calculator checks, here and in plugins."""
+"""Registry of the calculator checks of mdnum and of plugins."""
 
 from __future__ import annotations
 

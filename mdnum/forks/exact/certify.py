@@ -49,7 +49,7 @@ _EXPONENTIAL = 0.95
 
 @dataclass(frozen=True)
 class PolicyHorizon:
-    """Number of steps for which one precision follows the exact history."""
+    """Number of steps for which a run in one precision follows the exact history."""
 
     # name, roles: of the precision, and its dtype by role
     name: str
@@ -80,7 +80,7 @@ class PolicyHorizon:
         return float("nan") if self.decision is None else self.decision.margins["A"]
 
     def is_all(self, dtype: str) -> bool:
-        """Return True if all roles have the given dtype."""
+        """Return True if all roles (state, force and others) have the given dtype."""
         return set(self.roles.values()) == {dtype}
 
 

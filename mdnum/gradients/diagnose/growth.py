@@ -73,7 +73,7 @@ class GradientGrowth:
 
 
 class GrowthWatch:
-    """Collector of `GradientGrowth` in a reverse pass."""
+    """Collector of gradient norms at every step of a reverse pass, for `GradientGrowth`."""
 
     def __init__(self, simulation: Simulation, names: Sequence[str], steps: int):
         self.simulation, self.names, self.steps = simulation, tuple(names), steps
@@ -185,7 +185,7 @@ class Scaling:
 
 
 class ScalingWatch:
-    """Collector of `Scaling` in a reverse pass."""
+    """Collector of overflow counts at every step of a reverse pass, for `Scaling`."""
 
     def __init__(self, steps: int, format: str = "float16"):
         self.format = formats.format_of(format)

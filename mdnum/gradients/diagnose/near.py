@@ -98,9 +98,9 @@ class Turns:
 
     @property
     def term(self) -> Float[np.ndarray, "turns columns"]:
-        """Largest possible contribution of the two crossings at each turning point. A distance that equals
-        the cutoff within its uncertainty is assumed to pass it by 1 % of the uncertainty. For other pairs,
-        the result is the change of the contribution with shorter time steps.
+        """Largest possible contribution of the two crossings at each turning point. If a distance equals the
+        cutoff within its uncertainty, a passage by 1 % of the uncertainty is assumed. For other pairs, the
+        result is the change of the contribution with shorter time steps.
         """
         bend, reach = self.table["bend"], self.reach
 

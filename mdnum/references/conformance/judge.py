@@ -118,7 +118,7 @@ def keys(count: int, i: ndarray, j: ndarray, shift: ndarray | None, *others: tup
 
 @dataclass(frozen=True)
 class Conventions:
-    """Conventions of a neighbor list, such as the sign of shifts. Every convention is correct."""
+    """Conventions of a neighbor list, such as the sign of shifts. Every convention is accepted."""
 
     full: bool = True  # every pair from both of its atoms (True), or once (False)
     sign: int = 1  # +1 where shifts are added to atom j, -1 where they are added to atom i
