@@ -85,7 +85,7 @@ def executed(file: Path, name: str) -> ModuleType:
 
 
 def search_last(folder: str | Path, module: str | None = None) -> None:
-    """Append a folder to the import path. Its files cannot hide installed packages.
+    """Append a folder to the import path. Files in the folder cannot hide installed packages.
 
     Args:
         folder: folder of the Python code that the user asked to run.

@@ -1,4 +1,4 @@
-"""Certify the decisions of a run, and their agreement with those of another run.
+"""Certify the decisions of a run, and that another run makes the same decisions.
 
 Up to the *certified horizon*, every decision margin of a run exceeded its rounding bound. Exact arithmetic
 would give the same decisions for the same states. Up to the end of *protection*, |distance - cutoff| of every

@@ -1,4 +1,4 @@
-"""The linearized run: how a small perturbation grows, and which decisions it changes.
+"""The linearized run: how a small perturbation grows and changes decisions.
 
 The tangent (the derivative of the state) is propagated along the recorded states. The reference trajectory is
 therefore the recorded run, bit for bit. The exponential growth rate of the tangent is the largest Lyapunov
@@ -243,8 +243,8 @@ class Lyapunov:
     def steps_to(self, start: float, end: float) -> float | None:
         """Return the step at which a displacement has grown from one length to another.
 
-        The displacement grows like the tangent during the run, and exponentially after it. The result is None
-        if a displacement without chaos does not reach `end` during the run.
+        The displacement grows like the tangent during the run, and exponentially after the run. The result is
+        None if a displacement without chaos does not reach `end` during the run.
 
         Args:
             start: largest displacement of an atom at the start, length; for example one rounding unit.

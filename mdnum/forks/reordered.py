@@ -2,14 +2,14 @@
 
 Newton's third law holds exactly. The format of a list thus changes only the order of sums. A dense or sparse
 list contains each pair twice. Each entry contributes half of the pair force. In a sparse list, entries in an
-atom's own row form one sum, those in other rows a second sum. Both sums are added. A loop over atom labels
+atom's own row form one sum, those in other rows a second sum. The two sums are added. A loop over atom labels
 gives the same result if rows are sorted. In a dense list, entries in other rows are added one by one to the
 sum over the atom's own row. An ordered-sparse list contains each pair of atoms once. Forces from atoms with
 larger labels form one sum, those from smaller labels another.
 
 Source: jax_md.smap.pair_neighbor_list of jax-md 0.2.29, whose forces are reproduced bit for bit
-(tests/forks/test_choices.py). XLA adds more than 32 slots of an atom in blocks of 32. This module does not
-reproduce such blocks.
+(tests/forks/test_choices.py). XLA adds more than 32 slots of an atom in blocks of 32. Such blocks are not
+reproduced here.
 """
 
 from __future__ import annotations

@@ -134,7 +134,7 @@ def floats(system: Any) -> dict[str, float]:
 
 
 def as_used(system: Any, key: str) -> tuple[float, Any]:
-    """Return a parameter as stored in the program, and the dtype in which it is used."""
+    """Return a parameter as stored in the program, and its dtype in computations."""
     value = floats(system)[key]
     if not isinstance(system, BallSystem):
         return value, "float64"

@@ -362,7 +362,7 @@ def reverse(
 
 
 class StretchReversal:
-    """State of a reverse pass through a recorded run; see `reverse`.
+    """State of a reverse pass through a recorded run (see `reverse`).
 
     Attributes:
         carry: the cotangents at the current step, atoms in the user's order. guard: radial speed below which

@@ -119,7 +119,7 @@ def _quiet_scatter() -> Iterator[None]:
 
 
 def upstream() -> ModuleType:
-    """Return the package jax_md; the first call imports the package, which takes seconds."""
+    """Return the package jax_md. The first call takes seconds to import the package."""
     with standard_promotion():
         import jax_md
         import jax_md.custom_partition
@@ -154,7 +154,7 @@ def as_neighbor_list(
 ) -> NeighborList:
     """Make a jax-md NeighborList from the neighbor list of another program.
 
-    The conversion also works inside jit. Padding entries keep their places.
+    The conversion also works inside jit. Padding entries keep their places in the arrays.
 
     Args:
         idx_dense: neighbors of each atom, in both directions, padded with the number of atoms. Entries of an
@@ -190,7 +190,7 @@ def listed(
     format: Format,
     code: Any = 0,
 ) -> NeighborList:
-    """Make a jax-md NeighborList from entries in jax-md's format; see `as_neighbor_list`."""
+    """Make a jax-md NeighborList from entries in jax-md's format (see `as_neighbor_list`)."""
     partition = upstream().partition
     return partition.NeighborList(
         idx=idx,
@@ -345,7 +345,7 @@ def dense_pairs(
     pbc: tuple[bool, bool, bool],
     r_list: float,
 ) -> Int[np.ndarray, "atoms slots"]:
-    """Return neighbors within r_list, found by jax-md; recently used `PairSearch` objects are reused."""
+    """Return neighbors within r_list, found by jax-md. Recent `PairSearch` objects are reused."""
     rows = np.ascontiguousarray(cell, np.float64)
     return _kept_search(rows.tobytes(), pbc, float(r_list))(np.asarray(positions))
 

@@ -521,7 +521,7 @@ def _of_width(text: str, wide: int) -> str:
 
 
 def _listed(rows: int, margins: bool) -> list[str]:
-    """Write code that tests which of eight slots are in use, and clears their decisions."""
+    """Write code that tests which of eight neighbor slots are in use, and clears all eight decisions."""
     lines = []
     for k in range(8):
         lines += [
@@ -651,7 +651,7 @@ define i64 @called(i64 %frame) {{
 
 @cache
 def _registered(source: str, cpu: str = "") -> str:
-    """Compile a loop for a processor (default: this one) and register it. Return its name in XLA."""
+    """Compile and register a loop for a processor (default: this one). Return its name in XLA."""
     name = f"mdnum_pairs_{cpu}{hashlib.sha256(source.encode()).hexdigest()[:16]}"
     features = "" if cpu else llvm.get_host_cpu_features().flatten()
     machine = llvm.Target.from_default_triple().create_target_machine(
@@ -757,13 +757,13 @@ def _work(job):
 
 @njit
 def _leave(job):
-    """Release a job; the last thread that uses the job frees its memory."""
+    """Release a job. The last thread that uses the job frees its memory."""
     if added(job + 8 * _USERS, -1) == 1:
         free(job)
 
 
 def _help(job):
-    """Task of a helper thread: process blocks of a job, then release it."""
+    """Task of a helper thread: process blocks of a job, then release the job."""
     _work(job)
     _leave(job)
     return 0

@@ -1,4 +1,4 @@
-"""Tables of the pairs inside the cutoff and of their flips."""
+"""Tables of the pairs inside the cutoff and of the flips."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from jaxtyping import Bool, Float, Int
 
 
 class Columns:
-    """Base class of tables, which are dataclasses with columns of equal length. The first field is an array.
+    """Base class of tables. A table is a dataclass with columns of equal length. The first field is an array.
 
     A field that is not an array is one text for all rows, or None if unknown.
     """
@@ -28,7 +28,7 @@ class Columns:
         return all(map(np.array_equal, vars(self).values(), vars(other).values()))
 
     def to_pandas(self) -> Any:
-        """Return a DataFrame of the known columns; needs pandas."""
+        """Return a pandas DataFrame of the known columns."""
         from pandas import DataFrame
 
         return DataFrame({name: column for name, column in vars(self).items() if column is not None})

@@ -21,7 +21,7 @@ _DIGITS = 6
 
 
 def _programs(closed: Any) -> Iterator[Any]:
-    """Yield a jaxpr and all jaxprs that it calls."""
+    """Yield a jaxpr and the jaxprs called in it."""
     yield closed
     for equation in closed.eqns:
         for inner in jax.tree.leaves(
@@ -50,7 +50,7 @@ def held_numbers(closed: Any, least: int = 10) -> int:
 def single_numbers(closed: Any) -> list[str]:
     """Return the constants of a jaxpr that were rounded to float32, as short decimal numbers.
 
-    Such constants have fewer digits than other float64 numbers.
+    Constants rounded to float32 need fewer digits than other float64 numbers.
     """
     numbers: dict[str, None] = {}
     for program in _programs(closed):

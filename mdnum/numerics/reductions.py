@@ -105,7 +105,7 @@ class Exact(Reduction):
     """
 
     def sum_of(self, terms: jax.Array, add: Add) -> jax.Array:
-        """Return the sum, which is computed with integer additions only."""
+        """Return the sum, computed with integer additions only."""
         dtype, shape = terms.dtype, terms.shape[1:]
         form = format_of(np.dtype(dtype).name)
         flat = terms.reshape(terms.shape[0], -1)
@@ -148,7 +148,7 @@ class FixedPoint(Reduction):
             raise InputError(f"bits = {self.bits} is out of range", remedy="Choose bits from -1000 to 1000.")
 
     def sum_of(self, terms: jax.Array, add: Add) -> jax.Array:
-        """Return the sum, which is computed with one int64 as accumulator."""
+        """Return the sum, computed with one int64 as accumulator."""
         scaled = terms.astype(jnp.float64) * 2.0**self.bits
         fits = jnp.all(jnp.abs(scaled) <= 2.0**62 / terms.shape[0], axis=0)
         total = jnp.sum(jnp.rint(jnp.where(fits, scaled, 0.0)).astype(jnp.int64), axis=0)

@@ -1,10 +1,10 @@
 """Summation orders and their error bounds.
 
 A summation order is used in two ways. The force loop adds blocks of terms, and carries a partial sum from
-block to block. The terms of a whole neighbor list are therefore never stored at once. If an order needs all
-terms, they are stored and added at the end. Code outside of the force loop passes a whole array, and gets the
-sum over its first axis. The sum is rounded after every addition. A numpy loop in the dtype of the terms gives
-the same bits. `jnp.sum`, in contrast, adds 16-bit terms in float32.
+block to block. The terms of a whole neighbor list are therefore never stored at once. An order that needs all
+terms stores the terms and adds them at the end. Code outside of the force loop passes a whole array, and gets
+the sum over its first axis. The sum is rounded after every addition. A numpy loop in the dtype of the terms
+gives the same bits. `jnp.sum`, in contrast, adds 16-bit terms in float32.
 
 The derivative of every sum is that of the exact sum.
 """
@@ -243,7 +243,7 @@ class Twice(Reduction):
     """
 
     def sum_of(self, terms: jax.Array, add: Add) -> jax.Array:
-        """Add all halved terms twice; halving is exact."""
+        """Add all halved terms twice. Halving is exact."""
         halves = terms * jnp.asarray(0.5, terms.dtype)
         return in_order(halves, add, in_order(halves, add))
 

@@ -204,7 +204,7 @@ class Growth:
 
     @property
     def plain(self) -> bool:
-        """True if the distance clearly grows. Otherwise the fit is a fit of noise."""
+        """True if the distance clearly grows. Otherwise the growth rate is a fit of noise."""
         return bool(np.isfinite(self.rate) and self.rate > 0 and self.r_squared > FITS)
 
 
@@ -346,7 +346,7 @@ def judge(
     other: Sequence[Delay] = (),
     ended: Mapping[str, Any] | None = None,
 ) -> ForkVerdict:
-    """Return the verdict on whether flips caused the split of two runs, or made it earlier.
+    """Return the verdict on whether flips caused the split of two runs or made the split earlier.
 
     Args:
         dates: steps at which the pair of runs diverges.
@@ -460,7 +460,7 @@ def _outlook(free: Float[np.ndarray, "steps"], tolerance: float) -> tuple[Reason
 
 
 def _expected(separation: Float[np.ndarray, "steps"], tolerance: float, seen: int) -> float | None:
-    """Predict when a counterfactual run splits from run A. None if their distance does not grow."""
+    """Predict when a counterfactual run splits from run A. None if the distance does not grow."""
     fit = growth(separation[: seen + 1], tolerance)
     now = float(separation[seen])
     if not (fit.plain and now > 0):

@@ -141,8 +141,8 @@ def short_listed_eam(file: Path) -> Calculator:
 class EnergyOnNeighborList(ClassicalCalculator):
     """ASE calculator for an energy function, evaluated on ASE's neighbor list.
 
-    The calculator is a reference for neighbor lists, cutoff decisions and time steps. It does not test the
-    energy function and its derivatives: jax computes both here, too.
+    The calculator is a reference for neighbor lists, cutoff decisions and time steps. The energy function
+    itself is not tested, because jax computes it here, too.
     """
 
     implemented_properties = ["energy", "free_energy", "forces", "stress"]  # noqa: RUF012

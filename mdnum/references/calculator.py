@@ -78,7 +78,7 @@ class MdnumCalculator(ClassicalCalculator):
 
     Use this calculator to relax structures with ase.optimize, or to compute stress and equations of state.
     The Verlet list is kept until atoms or box have moved too far for its skin. For molecular dynamics, use
-    the function `rollout` of mdnum, which records flips.
+    the function `rollout` of mdnum to record flips.
 
     Args:
         system: a `Simulation`, a `System`, or the name or path of a system file; the evaluated atoms may
@@ -129,7 +129,7 @@ class MdnumCalculator(ClassicalCalculator):
 
     @property
     def simulation(self) -> Simulation | None:
-        """The simulation evaluated by the last call; None before the first call."""
+        """The simulation evaluated by the last call. None before the first call."""
         return None if self._evaluator is None else self._evaluator.simulation
 
     def set(self, **changes: Any) -> dict[str, Any]:

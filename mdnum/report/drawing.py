@@ -112,7 +112,7 @@ def envelope(
 
 
 def legend(axes: Axes) -> None:
-    """Draw a legend above the axes, where it covers no data."""
+    """Draw a legend above the axes. A legend there covers no data."""
     handles, labels = axes.get_legend_handles_labels()
     if handles:
         longest = max(len(label) for label in labels)
@@ -245,7 +245,7 @@ def _scale(axes: Axes, name: str, scale: str, plot: Plot) -> None:
 
 
 def _series(axes: Axes, series: Series, bases: dict[str, float], covered: int) -> None:
-    """Draw a series of points. The line is broader if later series would hide it."""
+    """Draw a series of points. The line is broader if later series would hide a thin line."""
     x, y = (np.asarray(getattr(series, name), float) - bases[name] for name in "xy")
     # what is infinite, or too large for an axis to have room beyond it, leaves a gap
     there = (np.abs(x) < 1e250) & (np.abs(y) < 1e250)

@@ -257,7 +257,7 @@ class Engine:
         return min(1 << (rows.bit_length() - 1), room_for(int(self.last + 1), per_row))
 
     def take(self, turn: int, words: int) -> EpochRecord:
-        """Return one of two buffers for a record. The loop that fills the buffer takes it over (donation)."""
+        """Return one of two buffers for a record. The loop that fills the buffer owns it (donation)."""
         rows, held, most = self._room(words), self._records[turn], self.program.most
         self._records[turn] = None
         # as many as a list's life brings, or a large system sorts its atoms several times for one list
@@ -270,7 +270,7 @@ class Engine:
         return empty_record(rows, words, self.simulation.atoms, dtype, self.record, *rest)
 
     def give(self, turn: int, record: EpochRecord) -> None:
-        """Return a record to the engine, which uses it again as a buffer."""
+        """Return a record to the engine for use as a buffer."""
         self._records[turn] = record
 
     def segments(self) -> Iterator[Segment]:

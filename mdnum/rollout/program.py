@@ -59,7 +59,7 @@ class MdProgram:
 
     @property
     def scale(self) -> float:
-        """Longest cutoff radius, which is used as the length scale of the system."""
+        """Longest cutoff radius, the length scale of the system."""
         return self.simulation.r_cut
 
     @property
@@ -133,7 +133,7 @@ class MdProgram:
         return list(zip(whole[: len(free)], whole[len(free) :], strict=True))
 
     def nudged(self, size: float, count: int, seed: int) -> list[MdProgram]:
-        """Return randomly displaced copies of the simulation; the largest displacement is about `size`.
+        """Return randomly displaced copies of the simulation. The largest displacement is about `size`.
 
         The largest displacement is at least one ulp of a coordinate.
         """

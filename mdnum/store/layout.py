@@ -81,7 +81,7 @@ class Layout:
         return tuple(name for name in self.tables if not name.endswith("?"))
 
     def keeps(self, name: str) -> bool:
-        """Return True if a file other than a table belongs to the layout. Its digest is then checked."""
+        """Return True for a file of the layout that is not a table. Its digest is then checked."""
         fixed = ("summary.json", self.resumes_from)
         return name in fixed or any(fnmatchcase(name, pattern) for pattern in self.further.split())
 

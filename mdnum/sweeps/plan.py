@@ -23,7 +23,7 @@ Setting = tuple[str, ...]
 
 @dataclass(frozen=True)
 class Question:
-    """Arguments of a sweep; see `mdnum.sweep`."""
+    """Arguments of a sweep (see `mdnum.sweep`)."""
 
     seeds: int | Sequence[int] = 4
     measure: Sequence[str] | str = USUAL["md"]

@@ -1,8 +1,8 @@
 """Means over random seeds, and differences between settings, each with its statistical error.
 
 The error of a run's mean is estimated from autocorrelation. A second estimate uses the scatter of means over
-random seeds. Errors from autocorrelation have many degrees of freedom. Such errors are too small if the run
-is shorter than the slowest relaxation. Each error is therefore multiplied by one factor. The scatter of means
+random seeds. Errors from autocorrelation have many degrees of freedom. The errors are too small if a run is
+shorter than the slowest relaxation. Each error is therefore multiplied by one factor. The scatter of means
 over all seeds and settings determines this factor.
 """
 
@@ -76,7 +76,7 @@ def estimates(found: Mapping[K, Sequence[tuple[float, float, float]]]) -> dict[K
 
 
 class _Runs(NamedTuple):
-    """Variance of a mean over runs, from their errors and from their scatter. An unknown variance is nan."""
+    """Variance of a mean over runs, from the errors and the scatter of the runs. nan if unknown."""
 
     runs: int
     within: float

@@ -97,7 +97,7 @@ def find(name: str | Path) -> tuple[str, Path]:
 
 
 def shown(path: Path) -> str:
-    """Return a path for messages, relative to the working directory if it lies inside."""
+    """Return a path for messages, relative to the working directory if possible."""
     try:
         return str(path.resolve().relative_to(Path.cwd()))
     except ValueError:
@@ -105,7 +105,7 @@ def shown(path: Path) -> str:
 
 
 def _made(folder: str | Path) -> Path:
-    """Create a folder if it is missing, and return its path."""
+    """Create a missing folder, and return its path."""
     target = Path(folder)
     with disk_errors(target):
         target.mkdir(parents=True, exist_ok=True)
@@ -212,7 +212,7 @@ class System:
         return toml.dump({"name": self.name, **spec})
 
     def write(self, folder: str | Path) -> Path:
-        """Write system.toml, structure.extxyz and the potential's tables; return the path of system.toml."""
+        """Write system.toml, structure.extxyz and the potential's tables. Return the path of system.toml."""
         target = _made(folder)
         with disk_errors(target):
             for table in self.tables:
@@ -293,7 +293,7 @@ class BallSystem:
         return toml.dump({"name": self.name, **self.spec.model_dump(exclude_none=True)})
 
     def write(self, folder: str | Path) -> Path:
-        """Write the system file system.toml; return its path."""
+        """Write the system file system.toml. Return its path."""
         path = _made(folder) / SYSTEM_FILE
         write_text(path, self.to_toml())
         return path

@@ -1,4 +1,4 @@
-"""Parameters of a simulation: their paths, values and units, and how to change them.
+"""Parameters of a simulation: paths, values, units, and changes of values.
 
 A parameter is a number or an array of numbers. The name of a parameter is a path. Paths are keys of a system
 file ("potential.sigma", "cutoff.radius", "dynamics.timestep"). Other paths lead to a component of a potential
@@ -75,7 +75,7 @@ class Parameter:
 
 
 def parameters(simulation: Simulation) -> dict[str, Parameter]:
-    """Return all parameters of a simulation by path. `changed` changes their values.
+    """Return all parameters of a simulation by path. The function `changed` changes parameter values.
 
     Example:
         >>> mdnum.parameters(sim)["potential.sigma"].value
@@ -198,8 +198,8 @@ def pair_leaves(model: CutPotential | Channels, shared: bool = True, species: bo
     """Return the parameter arrays of pair potentials and of their cutoffs, by path.
 
     `shared` adds arrays that do not depend on the pair type. `species` adds arrays with one entry per
-    species. If all cutoff radii are equal, their path is `cutoff.radius`. Otherwise each term has its own
-    path. Terms with equal cutoff radii share one array.
+    species. If all cutoff radii are equal, the path is `cutoff.radius`. If cutoff radii differ, each term has
+    its own path. Terms with equal cutoff radii share one array.
     """
     found: dict[str, Any] = {}
     for part in model.parts:
@@ -383,7 +383,7 @@ def resolve(simulation: Simulation, word: str, known: Sequence[str]) -> str:
 
 
 def changed(simulation: Simulation, values: Mapping[str, Any]) -> Simulation:
-    """Change values of system-file keys or parameters; return the new, validated simulation.
+    """Change values of system-file keys or parameters. Return the new, validated simulation.
 
     A simulation from a system file is rebuilt with the new values. The new simulation has no system file if a
     changed parameter has no key there.

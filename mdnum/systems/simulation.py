@@ -123,7 +123,7 @@ class Simulation:
 
     @property
     def file(self) -> System | None:
-        """System file that describes the simulation, or None if no file describes it exactly."""
+        """System file that describes the simulation exactly, or None."""
         its = self.origin.parts
         same = bool(its) and all(getattr(self, name) is part for name, part in its.items())
         return self.origin.system if same else None
@@ -197,7 +197,7 @@ class Simulation:
 
     @property
     def smooth(self) -> Simulation:
-        """The same system with a floating-point state, which can be differentiated."""
+        """The same system with a floating-point state, for derivatives."""
         return self if self.fixed_point is None else replace(self, fixed_point=None)
 
     @property
@@ -298,7 +298,7 @@ class Simulation:
 
     @property
     def lists(self) -> tuple[Any, ...]:
-        """Settings that determine the neighbor lists; equal settings give equal neighbor lists."""
+        """Settings that determine the neighbor lists. Equal settings give equal neighbor lists."""
         return self.rule, self.builder
 
     def verlet_list(self, skin: float | None = None) -> VerletList:
@@ -350,7 +350,7 @@ class Simulation:
     def with_cutoff(self, cutoff: str | Cutoff) -> Simulation:
         """Return the system with another kind of cutoff, but the same radius.
 
-        The onset of the switching function is kept. Without one, it is 0.9 of the cutoff radius.
+        The onset of the switching function is kept. Without an onset, 0.9 of the cutoff radius is used.
         """
         made = CUTOFFS.parse(cutoff) if isinstance(cutoff, str) else cutoff
         return self._ended(lambda _: made)
@@ -398,7 +398,7 @@ class Simulation:
         cell: Float[np.ndarray, "3 3"] | None = None,
         stress: bool = True,
     ) -> Evaluation:
-        """Compute energy and forces of a configuration; `Evaluator.__call__` describes the arguments."""
+        """Compute energy and forces of a configuration. `Evaluator.__call__` describes the arguments."""
         return Evaluator(self, skin=0.0, often=False)(positions, cell, stress)
 
     def numbers(self, positions: np.ndarray | None = None) -> tuple[float, dict[str, jax.Array]]:

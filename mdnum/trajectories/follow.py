@@ -162,7 +162,7 @@ class Pass:
 
     @property
     def odd(self) -> dict[str, Any] | None:
-        """Contradiction between displacements, velocities and times; None if there is none."""
+        """Contradiction between displacements, velocities and times, or None."""
         return odd_flight(self.flights)
 
 
@@ -172,9 +172,9 @@ def follow(
 ) -> Iterator[Pass]:  # fmt: skip
     """Read each frame once. Pass rows of the tables "members", "flips", "frames" and "motion" to `sink`.
 
-    If `residues` is given, pairs of residues are examined; `groups` still contains atoms. The same `Pass` is
+    If `residues` is given, pairs of residues are examined. `groups` still contains atoms. The same `Pass` is
     yielded after each frame. Iteration may stop at any frame. Memory use does not grow with the number of
-    frames. Reading ends at the first unreadable or unusable frame; earlier results are kept.
+    frames. Reading ends at the first unreadable or unusable frame. Earlier results are kept.
 
     Raises:
         InputError: the first frame cannot be read or used, so there are no results to keep.
@@ -363,7 +363,7 @@ def differing_rows(
 ) -> dict[str, np.ndarray]:
     """Return table columns for the pairs inside the cutoff in only one trajectory.
 
-    A pair is ambiguous if rounded coordinates in a file may have moved it across the threshold.
+    A pair is ambiguous if rounded coordinates may have moved the pair across the threshold.
     """
     rule = sides[0].tracker.rule
     i, j, rank = (np.array([pair[k] for pair in pairs], np.int64) for k in range(3))
@@ -386,7 +386,7 @@ def differing_rows(
 def _thresholds(
     i: np.ndarray, j: np.ndarray, inside: np.ndarray, rule: Rule, side: ComparedSide
 ) -> Float[np.ndarray, "pairs"]:
-    """Return each pair's threshold distance; for nearest-neighbor rules, the threshold depends on i."""
+    """Return each pair's threshold distance. For nearest-neighbor rules, it depends on i."""
     if isinstance(rule, CutoffRule):
         return np.full(len(i), rule.radius)
     if isinstance(rule, SpeciesCutoffs):
@@ -487,8 +487,8 @@ def _apart(
 ) -> tuple[Separation, float]:
     """Return each atom's distance between two files without a common shift, and an error bound.
 
-    A common shift is removed only if it explains nearly all of the distances. Different origins cause a
-    common shift, or removed center-of-mass motion in one file.
+    A common shift is removed only if the shift explains nearly all of the distances. Different origins, or
+    removed center-of-mass motion in one file, cause a common shift.
     """
     now = separation(a, b, atoms)
     allowed = sum(side.position_bound(now.periods) for side in sides)

@@ -1,4 +1,4 @@
-"""Membership rules: they define the neighbors of an atom.
+"""Membership rules: definitions of the neighbors of an atom.
 
 A rule is *symmetric* if i and j are neighbors of each other. In a *directed* rule, j may be a neighbor of i
 although i is not a neighbor of j. Squared distances are compared in float64. Every decision has a margin, a

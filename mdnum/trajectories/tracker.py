@@ -35,7 +35,7 @@ HORIZON = 0.02
 
 
 def atoms_of(groups: Groups) -> AtomIndices:
-    """Return the atoms in either of two groups; None for all atoms."""
+    """Return the atoms in either of two groups. None for all atoms."""
     some = [one for one in groups if one is not None]
     return np.unique(np.concatenate(some)) if some else None
 
@@ -54,7 +54,7 @@ class Moment(Placed):
 class Tracker:
     """Tracker of the flips between consecutive frames, as defined by a membership rule.
 
-    A tracker stores a single frame, however many frames it reads. It can be pickled.
+    A tracker stores a single frame, however many frames it reads. Trackers can be pickled.
 
     Args:
         rule: the membership rule that defines neighbors.
@@ -198,7 +198,7 @@ class Tracker:
         return Moment(positions, lattice, rounding, np.zeros(len(self._who.radii), np.int64), none, none)
 
     def _decided(self, now: Moment) -> Moment:
-        """Find the neighbors at a frame and store their number."""
+        """Find the neighbor pairs at a frame and store the number of pairs."""
         rule, bound, who = self.rule, self.bound + now.rounding, self._who
         if isinstance(rule, Nearest | Capped):
             reach = rule.reach if np.isfinite(rule.reach) else 0.0

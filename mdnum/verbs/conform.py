@@ -76,7 +76,7 @@ class Options:
 
 @dataclass
 class Examination(CaseAnswers):
-    """State of an examination, stored in answers.json to resume it."""
+    """State of an examination, stored in answers.json for later continuation."""
 
     word: str = field(kw_only=True)  # what names the list; empty where it has no name
     tested: tuple[str, str | None] = field(kw_only=True)  # name and version of the list
@@ -192,7 +192,7 @@ def conform(
             return summary_of(found, _write_scripts(folder, found), options.seed)
 
         def saved(urgent: bool) -> None:
-            """Save the latest result; write scripts and summary at intervals."""
+            """Save the latest result. Write scripts and summary at intervals."""
             nonlocal due
             kept.save(urgent)
             if (now := monotonic()) >= due:

@@ -126,7 +126,7 @@ def about(name: str) -> str:
 
 
 def load(name: str) -> ModuleType:
-    """Return the module of a demonstration; its function `run()` runs the demonstration.
+    """Return the module of a demonstration. The function `run()` runs the demonstration.
 
     Raises:
         InputError: no demonstration has this name.

@@ -689,7 +689,7 @@ def _words(table: AtomTable, atoms: np.ndarray) -> list[str]:
 
 
 def _as_asked(row: dict[str, Any], classes: Classes, groups: Groups) -> dict[str, Any]:
-    """Swap the two atom classes in a table row if they are not in the order of the two selections."""
+    """Put the two atom classes of a table row in the order of the two selections."""
     if groups[0] is None or groups[1] is None:
         return row
     first, second = ({classes.names[at] for at in np.unique(classes.of[group])} for group in groups)

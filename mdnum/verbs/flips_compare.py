@@ -38,7 +38,7 @@ def compare(
     between: tuple[str, str] | None,
     **keep: Unpack[Keep],
 ) -> Outcome:
-    """Find the frame at which two trajectories diverge; see `mdnum.verbs.flips.flips`.
+    """Find the frame at which two trajectories diverge (see `mdnum.verbs.flips.flips`).
 
     Raises:
         InputError: the trajectories do not contain the same atoms.
@@ -269,7 +269,7 @@ def _order(view: ComparisonView, one: Mapping[str, Any]) -> str:
 
 
 def _leap(view: ComparisonView, first: Mapping[str, Any]) -> Iterator[str]:
-    """Yield a sentence on whether trajectories diverge faster once their neighbor sets differ."""
+    """Yield a sentence on whether trajectories diverge faster once neighbor sets differ."""
     table, at = view.table("apart"), int(first["frame"])
     furthest = table["furthest"]
     # a difference that has just begun grows fast, whatever began it

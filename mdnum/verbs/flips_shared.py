@@ -134,7 +134,7 @@ class HeldRows:
 
     @property
     def full(self) -> bool:
-        """True if the buffer has so many rows that they should be written."""
+        """True if the buffer has enough rows to be written."""
         return self._count > _ROWS_HELD
 
     def hand_over(self, folder: RunFolder) -> None:
@@ -170,7 +170,7 @@ class FlipsView(View):
 
     @property
     def between(self) -> str | None:
-        """The two selections between which pairs were examined; None for all pairs."""
+        """The two selections between which pairs were examined. None for all pairs."""
         return " and ".join(f"“{one}”" for one in self.summary["between"] or ()) or None
 
     def time(self, text: str) -> str:
@@ -187,7 +187,7 @@ class FlipsView(View):
         return f"{plain(frames, digits)} frame{'' if frames == 1 else 's'}"
 
     def life(self, one: Mapping[str, Any], name: str = "median", of: str = "lifetime") -> str:
-        """Format a contact lifetime: a value, a bound, or why it is unknown.
+        """Format a contact lifetime: a value, a bound, or why the lifetime is unknown.
 
         A median lifetime of one frame is only an upper bound. Pairs with shorter lifetimes crossed the cutoff
         several times between frames.

@@ -379,7 +379,7 @@ def fork_forecast(
 
 
 def judge_forecast(view: View) -> Verdict:
-    """Return the verdict on a forecast: the first changed decisions, and how long it is valid."""
+    """Return the verdict on a forecast: the first changed decisions, and the last valid step."""
     s, unit = view.summary, view.units.length
     first, nearest, until, ends = s["first"], s["nearest"], s["until"], s["ends"]
     values = {**s, "unit": unit, "after": until + 1}

@@ -183,7 +183,7 @@ def _around(view: View) -> Iterator[Any]:
 
 
 def _atoms(view: View, figure: Canvas) -> None:
-    """Draw the atoms of runs A and B in two panels. The pair lies in the plane; a circle shows the cutoff."""
+    """Draw the atoms of runs A and B in two panels. A circle shows the cutoff."""
     d, table = view.summary["decision"], view.table("neighborhood")
     x, moved = (
         np.stack([table[k] for k in names], axis=1) for names in (("x", "y", "z"), ("dx", "dy", "dz"))

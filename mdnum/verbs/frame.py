@@ -117,7 +117,7 @@ class Verb:
 
 
 class Interrupted(KeyboardInterrupt):
-    """Raised if control-C was pressed after results were stored; `outcome` contains the results."""
+    """Raised if control-C was pressed after results were stored. `outcome` contains the results."""
 
     def __init__(self, outcome: Outcome):
         super().__init__(outcome)
@@ -126,7 +126,7 @@ class Interrupted(KeyboardInterrupt):
 
 @contextmanager
 def asked_to_stop() -> Iterator[Callable[[], bool]]:
-    """Yield a function that returns True after control-C; a second control-C raises KeyboardInterrupt.
+    """Yield a function that returns True after control-C. A second control-C raises KeyboardInterrupt.
 
     Python delivers signals only to the main thread. In other threads, the function returns False.
     """
@@ -174,9 +174,9 @@ class UnknownKeyword(InputError, TypeError):
 
 
 def keywords_checked(verb: V, more: Iterable[str] = (), name: str = "") -> V:
-    """Make a public function reject unknown keyword arguments before it reads or writes files.
+    """Make a public function reject unknown keyword arguments.
 
-    Otherwise a misspelled keyword in `**keep` would raise an error only when the output folder is made. Until
+    A misspelled keyword in `**keep` would otherwise raise an error only when the output folder is made. Until
     then, the function would use the default value of the misspelled option.
 
     Args:
@@ -252,7 +252,7 @@ def content(verb: str, asked: Mapping[str, Any]) -> str:
 
 @dataclass
 class Answer:
-    """Output folder while it is being filled."""
+    """Output folder that is being filled."""
 
     folder: RunFolder  # that is filled
     log: Progress  # passes progress on and writes it to log.txt

@@ -52,7 +52,7 @@ def copy(system: str, target: Path | None = None) -> Reply:
 def _size_in(file: Path) -> dict[str, Any]:
     """Read the number of atoms or balls and the description from a shipped system file.
 
-    Building all systems would require importing jax and ASE, which takes seconds.
+    Building all systems would import jax and ASE. Such imports take seconds.
     """
     table = tomllib.loads(file.read_text(encoding="utf-8"))
     about, start, structure = table["about"], table.get("start", {}), table.get("structure", {})

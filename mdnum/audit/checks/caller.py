@@ -63,7 +63,7 @@ class CallerCheck(AuditCheck):
 
 
 def _changes(atoms: Atoms, rng: np.random.Generator) -> Iterator[tuple[str, Callable[[Atoms], Any]]]:
-    """Yield the name of each quantity, and a function that changes it in an `Atoms` object."""
+    """Yield the name of each quantity of an `Atoms` object, and a function that changes it."""
     moves = 0.02 * rng.uniform(-1, 1, (len(atoms), 3))
     yield "positions", lambda there: np.add(there.positions, moves, out=there.positions)
     if len(set(atoms.numbers)) > 1:

@@ -89,8 +89,8 @@ class InvarianceCheck(AuditCheck):
     """Do energy and forces of a structure depend on its representation?
 
     The calculator's noise is allowed, and so are differences that rounding of the coordinates can cause. Both
-    are measured. A transformation that the calculator does not support is skipped. If two representations
-    differ in energy or forces, `structures` contains both.
+    differences are measured. A transformation that the calculator does not support is skipped. If two
+    representations differ in energy or forces, `structures` contains both.
     """
 
     name, title, order, calls = "invariance", "Invariance", 40, 450
@@ -209,7 +209,7 @@ class InvarianceCheck(AuditCheck):
 
 
 class _Judge:
-    """Compares representations of a structure; allowed differences depend on the rounding of coordinates."""
+    """Compares representations of a structure. Allowed differences depend on the rounding of coordinates."""
 
     def __init__(self, subject: CalculatorSubject, rng: np.random.Generator):
         self.subject, self.worker, self._rng = subject, subject.fresh(), rng

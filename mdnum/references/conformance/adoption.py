@@ -7,7 +7,7 @@
         pairs = staticmethod(neighbor_list)
         limits = ListLimits(minimum_image=True)
 
-A failed test prints the error, and a script that reproduces it with a few atoms.
+A failed test prints the error, and a script that reproduces the error with a few atoms.
 """
 
 from __future__ import annotations
