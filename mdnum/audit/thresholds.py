@@ -342,7 +342,7 @@ def _with_end(
 def _root(curve: Curve, edge: float, room: float, power: int) -> float:
     """Use a power law of the force to find where an interaction ends.
 
-    If the last distance with a nonzero force agrees within the error, it is returned instead. The last
+    If the last distance with a nonzero force agrees within the error, that distance is returned. The last
     distance is more exact, unless rounding made the force zero.
     """
     places = edge - room * np.array([0.02, 0.01, 0.005])

@@ -1,7 +1,7 @@
 """Repeated runs around a fork: nearby atoms, imposed decisions and minimal causes.
 
-Decisions of run A can be imposed on run B. B makes all other decisions itself. The tool Verrou searches for
-the instructions that cause an error in a similar way.
+Decisions of run A can be imposed on run B. Run B makes all other decisions itself. The tool Verrou searches
+in a similar way for instructions that cause an error.
 """
 
 from __future__ import annotations
@@ -215,7 +215,7 @@ def disagreements(fork: Fork, i: int, j: int) -> list[tuple[int, int | None]]:
 
 @dataclass(frozen=True)
 class Minimal:
-    """A minimal set of pairs. Imposing run A's decisions on them keeps run B close to run A."""
+    """A minimal set of pairs. Decisions of run A on these pairs keep run B close to run A."""
 
     # pairs (i, j) whose pinning to A's decisions, from the start to the horizon, keeps B with A; None where
     # no set does

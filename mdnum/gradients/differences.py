@@ -1,6 +1,6 @@
 """Gradient methods with many runs: finite differences, and means over replicas.
 
-A replica is the same system with other initial velocities and other thermostat noise. Replicas run one after
+A replica is the same system with other initial velocities and thermostat noise. Replicas run one after
 another on each device, because their neighbor lists differ.
 
 If a parameter changes, pairs cross the cutoff at other steps. If the force jumps at the cutoff, the loss
@@ -226,7 +226,7 @@ class FiniteDifferences(Method):
 
 
 def _counter(progress: Progress | None, runs: int, phase: str) -> Callable[[], None]:
-    """Return a function that reports progress. Call it once per run."""
+    """Return a function that reports progress. Call this function once per run."""
     done = 0
 
     def count() -> None:

@@ -3,7 +3,7 @@
 A chunk is a scan over steps with one neighbor list. Chunks of steps limit the memory that reverse mode needs.
 A chunk ends early if the neighbor list must be rebuilt. The host then builds the list at the present
 positions. The states between chunks are stored. If memory is insufficient, every second state is dropped. The
-steps after it are then run again.
+steps between the remaining states are then run again.
 
 The differentiated program may round differently and then make other decisions. If decisions differ, the
 gradient belongs to another trajectory. All states and decisions are therefore compared with those of an

@@ -275,7 +275,7 @@ class HostCell:
 def wrap_positions(
     cell: Cell, positions: Float[np.ndarray, "atoms 3"]
 ) -> tuple[Float[np.ndarray, "atoms 3"], Int[np.ndarray, "atoms 3"]]:
-    """Wrap positions. Return them and the numbers of lattice vectors subtracted.
+    """Wrap positions. Also return the numbers of lattice vectors subtracted.
 
     Error: the first pass subtracts the product n * L, which is rounded. A second pass wraps positions that
     rounding left outside the box. A wrapped coordinate may equal the edge length L, if L is added to a tiny
@@ -328,7 +328,7 @@ def strain_loss(reference: Cell, now: Cell, r_list):
 
 
 def complete(cell: Float[np.ndarray, "3 3"], pbc: Bool[np.ndarray, "3"]) -> Float[np.ndarray, "3 3"]:
-    """Replace the lattice vectors of nonperiodic axes by unit vectors perpendicular to the others.
+    """Replace lattice vectors of nonperiodic axes by unit vectors perpendicular to the others.
 
     A tilted vector of a nonperiodic axis would change the images along periodic axes.
 

@@ -3,8 +3,8 @@
 A cutoff maps the value u and slope w = du/d(r²) of the bare potential to those of the cut potential, for
 pairs inside the cutoff. The module `decide` determines which pairs are inside the cutoff.
 
-A cutoff is a class with a formula `cut`, a name and a smoothness. The rest of the package finds it by its
-name in `CUTOFFS`. A class may also define the independent implementation `reference` and the interval
+A cutoff is a class with a formula `cut`, a name and a smoothness. The rest of the package finds a cutoff by
+its name in `CUTOFFS`. A class may also define the independent implementation `reference` and the interval
 arithmetic `enclose`. By default, `reference` and `enclose` are derived from `cut`.
 
 All formulas work with numpy and jax arrays. This module does not import jax.

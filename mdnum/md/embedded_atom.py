@@ -162,8 +162,8 @@ class EmbeddedAtom(ManyBody):
     """E = sum_i F(rho_i) + 1/2 sum_ij phi(r_ij), rho_i = sum_j density(r_ij), for one element.
 
     The EAM energy of jax-md requires a neighbor list in which no atom is its own neighbor. In jax-md, each
-    atom is its own neighbor, which adds the density at r = 0. The splines of jax-md use float32. Outside the
-    table they are 0.
+    atom is its own neighbor, which adds the density at r = 0. The splines of jax-md use float32 and are 0
+    outside the table.
 
     Error: energy and forces are NaN if an electron density is outside the embedding table. The error of the
     spline itself is not included.

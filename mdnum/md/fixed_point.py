@@ -162,7 +162,7 @@ def _depth(model: CutPotential) -> float:
 
 @dataclass(frozen=True)
 class FixedPointDecider(PairDecider):
-    """Decision whether a pair is inside the cutoff, by comparison of two integers.
+    """The rule that decides whether a pair is inside the cutoff, by comparison of two integers.
 
     The squared distance is an integer in units of the squared position spacing. A comparison has the form
     `r2 < limit` with an integer limit. The threshold for margins is half a unit below the limit. Margins are

@@ -128,7 +128,7 @@ def quantities_of(potential: Any) -> dict[str, Any]:
 
 
 def with_quantities(potential: Any, values: Mapping[str, Any]) -> Any:
-    """Return a copy of the potential with other parameter values. Works inside jit."""
+    """Return a copy of the potential with other parameter values (also inside jit)."""
     names, tree = list(leaves_by_path(potential)), jax.tree.structure(potential)
     leaves = [values.get(name, leaf) for name, leaf in zip(names, jax.tree.leaves(potential), strict=True)]
     whole = jax.tree.unflatten(tree, leaves)

@@ -15,8 +15,8 @@ ASE's results are converted where ASE differs from mdnum:
 | an energy function | no ASE class | the function on ASE's neighbor list, named in the label |
 | all others | no ASE class | plain numpy on ASE's neighbor list (`independent.py`), named in the label |
 
-ASE's LennardJones keeps a pair at r == rc, but ASE's neighbor lists omit it. The energy of such a pair is
-zero for shifted and switched cutoffs. Only its force can differ.
+ASE's LennardJones keeps a pair at r == rc, but ASE's neighbor lists omit it. For shifted and switched
+cutoffs, the energy of this pair is zero. Only the force can differ.
 """
 
 from __future__ import annotations

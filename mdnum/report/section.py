@@ -97,7 +97,7 @@ def _is_number(value: Any) -> bool:
 
 @dataclass(frozen=True)
 class Code:
-    """A file or a command to copy. On the report page it is folded below its title."""
+    """A file or a command to copy. On the report page, the text is folded below its title."""
 
     title: str  # what it is
     text: str  # word for word

@@ -174,8 +174,8 @@ class PairRecorder:
     """Recorder of all flips (pairs that cross the cutoff) in a simulation.
 
     A flip is a change of a pair's decision between two consecutive steps. The neighbor list may be rebuilt in
-    between. A pair that the old list lacks is recorded with the new list. A pair outside the new neighbor
-    list counts as outside the cutoff.
+    between. The flip of a pair that the old list lacks is recorded with the new list. A pair outside the new
+    neighbor list counts as outside the cutoff.
 
     Args:
         simulation: the system as objects.

@@ -230,7 +230,7 @@ def digest_of_file(file: BinaryIO) -> str:
 
 
 def load(root: Path) -> Manifest | None:
-    """Return the manifest of a run folder. None if it has none, as from older versions.
+    """Return the manifest of a run folder. None if there is none, as in older versions.
 
     Raises:
         FolderError: the manifest is damaged.

@@ -195,7 +195,7 @@ class RunFolder:
 
     @property
     def kind(self) -> str:
-        """Kind of the run folder. The command that created it sets the kind."""
+        """Kind of the run folder, set by the command that created the folder."""
         return self.layout.kind
 
     # -- writing ---------------------------------------------------------------------------------
@@ -292,7 +292,7 @@ class RunFolder:
         self._writing = self._beside.submit(write)
 
     def finalize(self) -> None:
-        """Merge part files into one parquet file per table. The run can still be resumed."""
+        """Finish the folder: merge part files into one parquet file per table. Resuming stays possible."""
         if self._pending is not None and self._pending[1] == self._rows():
             self.checkpoint(self._pending[0], force=True)
         for name in self.layout.always:
@@ -441,7 +441,7 @@ class RunFolder:
     def read(
         self, name: str, columns: Sequence[str] | None = None, rows: int | None = None
     ) -> dict[str, np.ndarray]:
-        """Return a table as numpy arrays by column name. Columns that it lacks are omitted."""
+        """Return a table as numpy arrays by column name. Missing columns are omitted."""
         table = self.table(name, columns, rows)
         declared = {} if self._layout is None else self._layout.columns(name)
         gaps = {key: table[key].null_count for key in table.column_names if table[key].null_count}
@@ -587,7 +587,7 @@ class RunFolder:
     # -- inside ----------------------------------------------------------------------------------
 
     def _usable(self) -> list[str]:
-        """Return the names of files in a folder for a new run. Raise an error if it is in use."""
+        """Return the names of files in a folder for a new run. Raise an error if the folder is in use."""
         there = self.path.iterdir() if self.path.is_dir() else ()
         present = sorted(entry.name for entry in there if entry.name != _LOCK)
         if present and not _came_to_nothing(self.path, present):
@@ -631,7 +631,7 @@ class RunFolder:
         return self._manifest[1]
 
     def _wrong(self, name: str) -> str:
-        """Return how a file differs from the manifest. "" if it does not, or is not listed."""
+        """Return how a file differs from the manifest. "" if the file is intact or not listed."""
         allowed = self._listed().get(name)
         if allowed is None:
             return ""
@@ -747,7 +747,7 @@ def restoring(path: Path) -> Iterator[None]:
 
 
 def expect(right: object, seen: str) -> None:
-    """Raise an error if a restored value is not as expected. Use it inside `restoring`.
+    """Raise an error if a restored value is not as expected, for use inside `restoring`.
 
     Raises:
         ValueError: the condition is false.

@@ -141,7 +141,8 @@ def _keep(trial: Trial, box: str) -> None:
 class _Moved:
     """Energy changes when one atom is displaced by lattice vectors.
 
-    The atom with the most neighbors is displaced. Pairs keep the nearest image of the original box.
+    The atom with the most neighbors is displaced. In a sheared box, pairs keep the nearest image of the
+    original box.
     """
 
     def __init__(self, trial: Trial):

@@ -1,11 +1,10 @@
-"""Interpretation of the six box numbers in a DCD file, by three conventions.
+"""Interpretation of the six box numbers in a DCD file.
 
 DCD files do not record the convention of the box. The six numbers may be lengths and cosines of the angles
 (NAMD, VMD, LAMMPS, MDAnalysis since 2.10). Other programs write lengths and angles in degrees (CHARMM before
 version 22, OpenMM, MDAnalysis before 2.10). CHARMM since version 22 writes a symmetric matrix of lattice
-vectors. With a wrong box, atoms overlap across the boundary, and wrapped atoms seem to leap. If several
-conventions fit the positions, the version number in the header decides. All programs except CHARMM write
-version 24.
+vectors. With a wrong box, atoms overlap across the boundary. If several conventions fit the positions, the
+version number in the header decides. All programs except CHARMM write version 24.
 """
 
 from __future__ import annotations
@@ -34,7 +33,7 @@ Examined = list[tuple[int, np.ndarray, np.ndarray]]
 
 
 def conventions(cell: Float[np.ndarray, "6"]) -> dict[str, Float[np.ndarray, "3 3"]]:
-    """Return the lattice vectors by each convention that gives a valid box. MDAnalysis's is first."""
+    """Return the lattice vectors by each valid convention. MDAnalysis's convention is first."""
     from MDAnalysis.lib.mdamath import triclinic_vectors
 
     angles, found = cell[[4, 3, 1]], {}

@@ -381,7 +381,7 @@ def _tiles(nodes, runs, a, b, codes, shifts, reach, made):
 
 @njit
 def _follow(before, now, order, home, vectors, change, inverse, periodic, center, columns):
-    """Write unwrapped coordinates. Return the two largest squared displacements and the sum of all.
+    """Write unwrapped coordinates. Return the two largest squared displacements and the sum of squares.
 
     The numbers of lattice vectors removed from each atom are stored in `home`.
     """

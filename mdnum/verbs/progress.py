@@ -108,7 +108,7 @@ class ProgressBar:
 
 
 def _drawn(stream: TextIO) -> Any:
-    """Start and return a progress bar. The method `stop` removes the bar."""
+    """Start and return a progress bar. Call `stop` to end the bar."""
     from rich.console import Console
     from rich.progress import BarColumn, Progress, SpinnerColumn, TextColumn
 
@@ -123,7 +123,7 @@ def _drawn(stream: TextIO) -> Any:
 
 
 class _Cell:
-    """A progress bar below a notebook cell. The method `stop` removes the bar."""
+    """A progress bar below a notebook cell. Call `stop` to end the bar."""
 
     def __init__(self, stream: TextIO):
         from IPython.display import display  # pyright: ignore[reportMissingImports]

@@ -1,4 +1,4 @@
-"""Compare forces with finite differences of the energy. The step suits the calculator's noise."""
+"""Compare forces with finite differences of the energy. The step length suits the calculator's noise."""
 
 from __future__ import annotations
 

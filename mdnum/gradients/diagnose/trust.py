@@ -1,9 +1,10 @@
 """The largest number of steps (horizon) for which a gradient can be trusted.
 
-Five limits end the trust in a gradient. (1) Another precision gives a different gradient. (2) Half the time
-step gives a different gradient. (3) A pair turned around close to its cutoff, so another time step could add
-or remove a flip. (4) Rounding determined a decision close to its threshold. (5) Gradients from other initial
-states scatter by more than their mean. If one of the five limits was not examined, the verdict is undecided.
+Each of five limits can end the trust in a gradient. (1) Another precision gives a different gradient. (2)
+Half the time step gives a different gradient. (3) A pair turned around close to its cutoff, so another time
+step could add or remove a flip. (4) Rounding determined a decision close to its threshold. (5) Gradients from
+other initial states scatter by more than their mean. If one of the five limits was not examined, the verdict
+is undecided.
 
 One run with its tangents (derivatives in forward mode) gives the gradients for all horizons.
 """
@@ -473,7 +474,7 @@ def _missed(
 
 
 def _shares(term: Float[np.ndarray, "terms columns"], size: Float[np.ndarray, "columns"]):
-    """Return contributions relative to the derivative, and their cumulative root of squares."""
+    """Return relative contributions, and the root of their cumulative sum of squares."""
     with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
         # a term that is not known weighs
         share = np.where(term == 0, 0.0, np.nan_to_num(np.abs(term) / size, nan=np.inf))

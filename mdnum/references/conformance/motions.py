@@ -321,7 +321,7 @@ def _among(room: float, way: ndarray, edge: float, n: int, count: int, little: f
 
 
 def _adrift(room: float, way: ndarray, edge: float, n: int) -> list[ndarray]:
-    """Return a path of two approaching atoms among ten others. All twelve drift together."""
+    """Return a path of two approaching atoms among ten others. All twelve atoms drift together."""
     start, end = _with(gas(12, edge, 180 + n), [4, 5], _walk(room, way, 0.5, edge, n))
     across = np.cross(way, np.roll(way, 1) + np.array([0.3, -0.2, 0.1]))
     across /= np.linalg.norm(across)
