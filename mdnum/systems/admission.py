@@ -139,10 +139,9 @@ def _keep(trial: Trial, box: str) -> None:
 
 
 class _Moved:
-    """Energy changes when one atom is displaced by lattice vectors.
+    """Energy changes when the atom with the most neighbors moves by lattice vectors.
 
-    The atom with the most neighbors is displaced. In a sheared box, pairs keep the nearest image of the
-    original box.
+    In a sheared box, pairs keep the nearest image of the original box.
     """
 
     def __init__(self, trial: Trial):

@@ -83,7 +83,7 @@ class Tiles:
     flips: Changed  # room for them; images further than the nearest do not occur
 
     def serve(self, before: Placed, now: Placed, radius: float, clear: float) -> bool:
-        """Update tiles to a new frame. Return True if they have all pairs closer than radius + `clear`."""
+        """Update tiles to a new frame. True if the tiles have all pairs closer than radius + `clear`."""
         if clear + 2.0 * self.doubt(now, radius) > self.clear:
             return False
         change = now.lattice.vectors - before.lattice.vectors
