@@ -196,9 +196,9 @@ def order_change(
 ) -> tuple[float, NoiseFloor]:
     """Reorder the atoms. Return the largest energy change (eV), and the noise if rounding explains it.
 
-    The noise is 0 if rounding does not explain the energy change. The noise is also 0 if energies and forces
-    vary by no more than the noise along a line of structures. Along a line, a rounding error varies randomly.
-    An error due to missing terms varies smoothly.
+    The noise is 0 if rounding does not explain the energy change. The noise is also 0 if the changes are
+    within the given `noise`. Along a line, a rounding error varies randomly. An error due to missing terms
+    varies smoothly.
     """
     count, none = len(atoms), NoiseFloor(0.0, 0.0)
     if count < 2:

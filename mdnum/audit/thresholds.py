@@ -365,8 +365,7 @@ def _beyond(
 ) -> Beyond | None:
     """Search for a cutoff beyond the scan, until the rest of the pair energy is negligible.
 
-    The result is None if no distance could be evaluated: periodic images are too close, or the calculator
-    fails.
+    The result is None if periodic images are too close, or if the calculator fails.
     """
     if pair.periodic:
         return None

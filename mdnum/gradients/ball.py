@@ -1,8 +1,8 @@
 """Gradient methods for a simulated bouncing ball; the methods treat contact decisions differently.
 
-The methods differentiate the executed operations (unrolled), the program with fixed decisions (frozen), or
-the loss averaged over random parameters (randomized). Methods that replace the contact by another model are
-in `ball_contacts`.
+Unrolled methods differentiate the executed operations. Frozen methods keep all decisions fixed. Randomized
+methods average the loss over random parameters. Methods that replace the contact by another model are in
+`ball_contacts`.
 
 JAX returns a derivative of 0.0 if the run did not use a parameter. JAX also returns 0.0 if the derivative
 underflowed or was clamped. The function `dependence` distinguishes the two cases.

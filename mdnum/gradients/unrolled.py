@@ -56,9 +56,7 @@ class Inputs(NamedTuple):
 
 
 class StepEnds(NamedTuple):
-    """Differentiable state between two steps: wrapped positions and half-kicked velocities of the atoms in
-    the user's order, sums of the loss, floating-point numbers of the integrator's extra state, and the box.
-    """
+    """Differentiable state between two steps. Velocities are half-kicked, atoms in the user's order."""
 
     x: Float[Array, "3 atoms"]
     v: Float[Array, "3 atoms"]

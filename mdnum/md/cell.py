@@ -264,7 +264,7 @@ class HostCell:
     def displacement(
         self, start: Float[np.ndarray, "... 3"], end: Float[np.ndarray, "... 3"]
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Return the components of the minimum image of end - start, with the bits of the force loop."""
+        """Return the minimum image of end - start by components. The force loop gives the same bits."""
         start, end = np.asarray(start, self.dtype), np.asarray(end, self.dtype)
         x, y, z = (end[..., k] - start[..., k] for k in range(3))
         if not any(self._lattice[2]):
@@ -278,8 +278,8 @@ def wrap_positions(
     """Wrap positions. Also return the numbers of lattice vectors subtracted.
 
     Error: the first pass subtracts the product n * L, which is rounded. A second pass wraps positions that
-    rounding left outside the box. A wrapped coordinate may equal the edge length L, if L is added to a tiny
-    negative number.
+    rounding left outside the box. A wrapped coordinate may equal the edge length L: a tiny negative number
+    plus L rounds to L.
     """
     wrapped = np.array(positions, np.float64, copy=True)
     images = np.zeros(wrapped.shape, np.int64)
@@ -296,7 +296,7 @@ def displacement(
     end: Float[np.ndarray, "... 3"],
     dtype: DTypeLike = np.float64,
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return the components of the minimum image of end - start, with the bits of the force loop."""
+    """Return the minimum image of end - start by components. The force loop gives the same bits."""
     return HostCell(cell, dtype).displacement(start, end)
 
 

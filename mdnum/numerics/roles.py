@@ -79,7 +79,7 @@ class PrecisionPolicy:
         """The dtype of the pair displacements from which forces are computed.
 
         For 32- and 64-bit forces, displacements have the force dtype. For 16-bit forces, displacements have
-        the dtype of cutoff decisions: differences of 16-bit numbers have almost no correct digits.
+        the dtype of cutoff decisions.
         """
         return self.dtype("force") if self.force in WIDE else self.dtype("decision")
 

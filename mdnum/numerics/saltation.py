@@ -2,8 +2,8 @@
 
 A perturbed trajectory reaches a threshold at a different time than the trajectory itself. In between, only
 one of the two trajectories follows the new equation of motion. To first order, the difference in time changes
-the tangent vector by a rank-one term. Derivatives of a time-stepping program lack the rank-one term, because
-time steps do not move with the event.
+the tangent vector by a rank-one term. Time steps do not move with the event. Derivatives of a time-stepping
+program therefore lack the rank-one term.
 
 The functions accept numpy and jax arrays with leading batch axes, also inside jit.
 """

@@ -160,7 +160,7 @@ def points_of(lines: Iterable[tuple[str, str, str, Any, Any]]) -> dict[str, np.n
 
 @dataclass(frozen=True)
 class Region:
-    """Grid of cells, with an integer for each cell and a word for each integer (such as "stable")."""
+    """Grid of cells. Each cell has an integer, each integer a word (such as "stable")."""
 
     # x, y: centers of the cells, shapes (columns,) and (rows,)
     x: np.ndarray

@@ -232,8 +232,8 @@ class RunFolder:
     def checkpoint_due(self) -> bool:
         """Return True if a new checkpoint is due.
 
-        The interval between checkpoints is 2 s, 1 % of the run's duration, or 50 times the duration of the
-        last checkpoint. The largest of the three is used. A killed run loses about 1 % of its computing time.
+        The interval is the largest of 2 s, 1 % of the run's duration, and 50 times the duration of a
+        checkpoint. A killed run loses about 1 % of its computing time.
         """
         now = time.monotonic()
         due = now - self._written >= max(2.0, 0.01 * (now - self._began), 50 * self._cost)

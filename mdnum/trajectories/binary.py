@@ -1,10 +1,10 @@
 """Readers of GROMACS's xtc and trr files. Each frame is checked before it is decoded.
 
-The library that decodes xtc files may divide by zero or write outside its buffers on damaged data. The
-process then crashes, and all earlier results are lost. The compressed stream contains the number of bits of
-each atom's coordinates. The header, the number of atoms, the bit counts and the length are verified without
-decoding. File damage that leaves a valid stream is not detected. Source of the xtc format: the algorithm of
-xdr3dfcoord (F. van Hoesel; GROMACS, libxdrfile).
+On damaged data, the xtc library may divide by zero or write outside its buffers. The process then crashes,
+and all earlier results are lost. The compressed stream contains the number of bits of each atom's
+coordinates. The header, the number of atoms, the bit counts and the length are verified without decoding.
+File damage that leaves a valid stream is not detected. Source of the xtc format: the algorithm of xdr3dfcoord
+(F. van Hoesel; GROMACS, libxdrfile).
 
 MDAnalysis's readers of xtc and trr keep an index file next to the trajectory. MDAnalysis may use an index
 file of another trajectory. MDAnalysis may write the index through symbolic links. This module uses no index

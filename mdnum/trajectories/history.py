@@ -213,8 +213,8 @@ def doublings(frames: int) -> list[int]:
 def crossings(frame: Frame, count: Callable[[Frame, Frame], int], move: float) -> tuple[int, float] | None:
     """Count the flips of pairs if all atoms move in straight lines for a short time.
 
-    The root mean square displacement of the atoms is `move`. Choose a short `move`, for straight paths, but
-    long enough that many pairs cross the cutoff. `count` returns the number of flips between two frames.
+    The root mean square displacement of the atoms is `move`. Choose `move` so short that paths are straight.
+    Many pairs must still cross the cutoff. `count` returns the number of flips between two frames.
 
     Returns:
         (number of flips, duration of the motion in the time unit of the velocities); None if no atom moves.

@@ -1,7 +1,7 @@
 """Flips of each image (i, j, shift) of a pair, for boxes with several images in range.
 
 The ledger of flips identifies an image by its rank in distance. Wrapping does not change the rank. If one
-image leaves and another enters, the ledger has no flip, but this module counts two.
+image leaves and another enters, the ledger has no flip. This module counts two flips.
 """
 
 from __future__ import annotations

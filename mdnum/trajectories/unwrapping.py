@@ -1,9 +1,9 @@
 """Unwrapping of atomic paths across box boundaries, and detection of discontinuities between frames.
 
 In each frame, wrapping must move atoms by lattice vectors of this frame. After other changes, the unwrapped
-path is wrong (von Bülow, Bullerjahn and Hummer, J. Chem. Phys. 153, 021101, 2020). A jump is removed by
-lattice vectors of the same frame, which preserves displacements (Bullerjahn, von Bülow, Heidari, Hénin and
-Hummer, J. Chem. Theory Comput. 19, 3406, 2023).
+path is wrong (von Bülow, Bullerjahn and Hummer, J. Chem. Phys. 153, 021101, 2020). Lattice vectors of the
+same frame remove a jump and preserve displacements (Bullerjahn, von Bülow, Heidari, Hénin and Hummer, J.
+Chem. Theory Comput. 19, 3406, 2023).
 """
 
 from __future__ import annotations

@@ -529,8 +529,8 @@ def last_below(
 ) -> tuple[int, bool]:
     """Return the last horizon before two successive errors above a limit, and whether there are any.
 
-    A single error is ignored, except at the last horizon: relative errors are large where a gradient changes
-    sign.
+    Relative errors are large where a gradient changes sign. A single error is therefore ignored, except at
+    the last horizon.
     """
     beyond = ~(np.max(np.stack(list(values.values())), axis=0) <= limit)
     lasting = beyond & np.append(beyond[1:], True)
