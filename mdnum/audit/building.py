@@ -143,7 +143,7 @@ class _Builder:
         return None
 
     def _mixed(self, made: Atoms) -> Atoms:
-        """Return the crystal, with a second element if the calculator distinguishes two."""
+        """Return the crystal. Add a second element if the calculator distinguishes two elements."""
         from ase.data import atomic_numbers
 
         self.best, symbol = made, str(made.symbols[0])

@@ -1,4 +1,4 @@
-"""Find parameter values at which the decisions of a run change, between two adjacent floats.
+"""Find the two adjacent parameter values between which the decisions of a run change.
 
 Between two boundaries, the result of a run is a smooth function of the parameter. At a boundary, decisions
 differ, and every later quantity of the run may jump.
@@ -324,7 +324,7 @@ def checked(program: Program, key: str, low: float, high: float) -> Number:
 
 
 def _grid(line: NumberLine, low: float, high: float, cells: int) -> list[int]:
-    """Return the ordinals of the grid points: evenly spaced floats, or all floats."""
+    """Return the ordinals of the grid points, which are evenly spaced floats or all floats."""
     first, final = line.places([low, high])[0], line.places([low, high])[-1]
     if final - first <= cells:
         return list(range(first, final + 1))

@@ -219,7 +219,7 @@ class RunTape:
 
     @property
     def jumps_unseen(self) -> tuple[float, float]:
-        """Derivatives of the loss by energy and virial of a frame. (0, 0) for equally spaced frames.
+        """Derivatives with respect to energy and virial of a frame. (0, 0) for equally spaced frames.
 
         For losses of a single frame, gradients omit jumps of energy and virial at flips.
         """

@@ -81,7 +81,7 @@ class Cutoff(ABC):
     def reference(
         self, r: Float[np.ndarray, "pairs"], u: Float[np.ndarray, "pairs"], du: Any, at: AtCutoff
     ) -> tuple[Float[np.ndarray, "pairs"], Float[np.ndarray, "pairs"]]:
-        """Return energy and derivative by r in float64 on the host, as a reference for `cut`.
+        """Return energy and derivative du/dr in float64 on the host, as a reference for `cut`.
 
         The default method differentiates the energy of `cut` with jax. The slope returned by `cut` is not
         used.
@@ -138,8 +138,8 @@ _ORDERS = len(_DERIVATIVES) - 1
 def check(cutoff: type[Cutoff] | Cutoff) -> None:
     """Check a cutoff's slope against its energy, and its smoothness against its declaration.
 
-    The test potentials are u = 1/r² and u = 1/r⁶ with r_cut = 2 and onset 1.6. Energy and derivatives by r²
-    (nested jvp) are evaluated within 2⁻⁴⁶ of the onset and of r_cut. The derivative one order above the
+    The test potentials are u = 1/r² and u = 1/r⁶ with r_cut = 2 and onset 1.6. Energy and derivatives (nested
+    jvp in r²) are evaluated within 2⁻⁴⁶ of the onset and of r_cut. The derivative one order above the
     declared smoothness must jump for at least one potential. An energy difference above 1e-9 u(r_cut) counts
     as a jump. A difference of derivative k is a jump if it exceeds 1e-5 u(r_cut) k! / (r_cut² - r_onset²)^k.
     Jumps elsewhere and derivatives beyond the sixth are not tested.
@@ -345,10 +345,10 @@ class _SwitchedInDistance(_Switching):
 
     @abstractmethod
     def switch(self, t) -> tuple[Float[Any, "..."], Float[Any, "..."]]:
-        """Return the switching function and its derivative by t in [0, 1]."""
+        """Return the switching function of t in [0, 1], and its derivative."""
 
     def switch_of_ball(self, t):
-        """Return the switching function and its derivative by t, in ball arithmetic."""
+        """Return the switching function of t and its derivative, in ball arithmetic."""
         return self.switch(t)
 
     def cut(self, r2, u, w, at):

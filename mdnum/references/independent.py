@@ -88,7 +88,7 @@ class Model(ABC):
 
     @abstractmethod
     def __call__(self, edges: Edges) -> tuple[ndarray, ndarray]:
-        """Return (energy of each atom, gradient of the total energy by displacement)."""
+        """Return (energy of each atom, gradient of the total energy with respect to displacements)."""
 
 
 class ClassicalCalculator(Calculator):
@@ -260,7 +260,7 @@ def _triplets(edges: Edges) -> tuple[ndarray, ndarray]:
 
 
 def _cosines(edges: Edges, e: ndarray, f: ndarray) -> tuple[ndarray, ndarray, ndarray]:
-    """Return cosines of the angles between edges e and f. Also return the gradients by d_e and d_f."""
+    """Return cosines of the angles between edges e and f, with gradients with respect to d_e and d_f."""
     re, rf = edges.r[e], edges.r[f]
     ne, nf = edges.d[e] / re[:, None], edges.d[f] / rf[:, None]
     cosine = np.einsum("ta,ta->t", ne, nf)
@@ -284,7 +284,7 @@ class _OneSpecies(Model):
 
     @abstractmethod
     def within(self, edges: Edges, unit: ndarray) -> tuple[ndarray, ndarray]:
-        """Return the energy of each atom and the gradient by each d, for edges within reach."""
+        """Return the energy of each atom and the gradient with respect to each d, for edges within reach."""
 
     def __call__(self, edges: Edges) -> tuple[ndarray, ndarray]:
         gradient, inside = np.zeros_like(edges.d), edges.r < self.reach

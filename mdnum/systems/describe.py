@@ -168,7 +168,7 @@ def _leaves(tree: Any) -> dict[str, Any]:
 
 
 def _code(function: Any) -> dict[str, Any]:
-    """Return source code and digest of a user's function. Without source, the digest is of its bytecode."""
+    """Return source code and digest of a user's function. Without source code, digest the bytecode."""
     if function is None:
         return {}
     try:

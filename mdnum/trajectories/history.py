@@ -203,7 +203,7 @@ class Strides(Sums):
 
 
 def doublings(frames: int) -> list[int]:
-    """Return the strides 1, 2, 4, ... (frames) that fit at least four times into the trajectory."""
+    """Return strides in frames (1, 2, 4, ...) that fit at least four times into the trajectory."""
     strides = [1]
     while (frames - 1) // (2 * strides[-1]) >= 4:
         strides.append(2 * strides[-1])

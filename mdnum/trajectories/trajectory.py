@@ -28,7 +28,7 @@ SAMPLE = 8
 
 
 class Trajectory(ABC):
-    """Frames of one file, in order. The file can be read any number of times.
+    """Frames of one file, which can be read any number of times in order.
 
     A subclass defines `has_atoms`, `raw_frames` and `decoded`. An exception in these methods is reported as
     an unreadable frame.

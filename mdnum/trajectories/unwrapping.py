@@ -42,7 +42,7 @@ class Unwrapping:
     _lengths: list[np.ndarray] = field(default_factory=list)  # distances in pairs at the first frames
 
     def see(self, frame: Frame) -> dict[str, Any] | None:
-        """Return the row of a frame in the table of motion. None unless the box is fully periodic."""
+        """Return a frame's row in the table of atomic motion. None unless the box is fully periodic."""
         x, cell = frame.positions if self.atoms is None else frame.positions[self.atoms], frame.box.matrix
         if not frame.box.pbc.all() or len(x) < 2:
             return None
@@ -84,7 +84,7 @@ class Unwrapping:
 
 
 def told(rows: Mapping[str, np.ndarray], atoms: int, timed: bool) -> dict[str, Any] | None:
-    """Summarize the table of motion as plain values. None for fewer than three frames."""
+    """Summarize the table of atomic motion as plain values. None for fewer than three frames."""
     if len(rows["frame"]) < 3:
         return None
     # before the first frame nothing moved

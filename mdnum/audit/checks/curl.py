@@ -1,4 +1,4 @@
-"""Check the work around small closed loops. The work is zero if forces derive from an energy."""
+"""Check the work around small closed loops. The work is zero if the forces are the gradient of an energy."""
 
 from __future__ import annotations
 

@@ -219,7 +219,7 @@ class Limit:
 
 @dataclass(frozen=True)
 class Judgment:
-    """The trust horizon of the derivatives by one or all parameters, and its limits."""
+    """The trust horizon of derivatives with respect to one or all parameters, and its limits."""
 
     # "trusted" where every limit was examined and none was met, "limited" where one was met, else "undecided"
     verdict: str
@@ -231,7 +231,7 @@ class Judgment:
 
 @dataclass(frozen=True)
 class Trust(Judgment):
-    """Number of steps for which a gradient can be trusted, for all parameters and for each."""
+    """Number of steps for which a gradient can be trusted, with a verdict for each parameter."""
 
     by: dict[str, Judgment]  # of each parameter, by full name
     tolerance: float  # relative difference above which two precisions, or two time steps, disagree
@@ -503,7 +503,7 @@ def _left_out(
 
 
 def relative(a: Horizons, b: Horizons) -> dict[str, Float[np.ndarray, "points"]]:
-    """Return the difference of two gradients by parameter and horizon, divided by the larger norm."""
+    """Return the difference of two gradients, divided by the larger norm, by parameter and horizon."""
     out = {}
     second = b.by_name()
     for name, first in a.by_name().items():
@@ -514,7 +514,7 @@ def relative(a: Horizons, b: Horizons) -> dict[str, Float[np.ndarray, "points"]]
 
 
 def standard_error(made: Sequence[Horizons]) -> dict[str, Float[np.ndarray, "points"]]:
-    """Return the standard error of the mean gradient by parameter and horizon, divided by its norm."""
+    """Return the relative standard error of the mean gradient, by parameter and horizon."""
     out = {}
     for name in made[0].by_name():
         each = np.stack([one.by_name()[name] for one in made])

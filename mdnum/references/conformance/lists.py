@@ -21,10 +21,10 @@ from mdnum.registry import Registry
 class KeptList(Protocol):
     """A neighbor list that is built and then updated. `answer.read` describes the pairs.
 
-    `allocate` builds a new neighbor list, also repeatedly. `update` receives the current positions. The pairs
-    must include every pair within r_cut at the current positions. Further pairs may be farther apart by less
-    than the skin. A neighbor list with its own padding must store it in the attribute `skin` (length). The
-    attribute `skin` is read after each call of `allocate`.
+    `allocate` builds a new neighbor list, and may be called again. `update` receives the current positions.
+    The pairs must include every pair within r_cut at the current positions. Further pairs may be farther
+    apart by less than the skin. A neighbor list with its own padding must store it in the attribute `skin`
+    (length). The attribute `skin` is read after each call of `allocate`.
     """
 
     def allocate(self, positions: ndarray, cell: ndarray, pbc: ndarray, r_cut: float, skin: float) -> Any:
