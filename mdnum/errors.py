@@ -1,4 +1,4 @@
-"""Exceptions whose messages state what was found, expected, and a remedy."""
+"""Exceptions whose messages state what was found, what was expected, and a remedy."""
 
 from __future__ import annotations
 
@@ -131,7 +131,7 @@ def expect_at_least(least: int, **numbers: int) -> None:
 
 
 def expect_path(given: object, remedy: str) -> None:
-    """Raise an error if a path is an object of another type.
+    """Raise an error if an argument is not a path.
 
     Raises:
         InputError: the object is not a path; the message contains its type and shape, but not its contents.

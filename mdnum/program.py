@@ -49,7 +49,7 @@ class Program(Protocol):
     def imposable(self) -> str | None: ...
 
     def check(self, other: Any) -> None:
-        """Raise an error if two programs differ in atoms, balls or kinds of decisions.
+        """Raise an error if two programs differ in numbers of atoms or balls, or kinds of decisions.
 
         Raises:
             InputError: the programs cannot be compared.
@@ -96,7 +96,7 @@ class Program(Protocol):
         ...
 
     def number(self, key: str) -> Number:
-        """Return a number of the system, given its key in the system file.
+        """Return a numerical parameter of the system, given its key in the system file.
 
         Raises:
             InputError: no parameter or several parameters match; the message lists the known parameters.

@@ -304,9 +304,9 @@ def _outliers(
 def _mismatch(curve: Curve, places: Float[np.ndarray, "points"]) -> Float[np.ndarray, "3 intervals"]:
     """Return three mismatches for each interval. Mismatches are small on a smooth curve.
 
-    The first two are differences of the predictions of energy and force. The third, energy change plus work,
-    falls with the fifth power of the spacing. The third mismatch detects the smallest jumps of the energy
-    alone.
+    The first two mismatches are differences between predictions of the energy and of the force. The third
+    mismatch, energy change plus work, falls with the fifth power of the spacing. The third mismatch detects
+    the smallest jumps of the energy alone.
     """
     values = curve.many(places)
     windows = np.lib.stride_tricks.sliding_window_view(values, 4, axis=1)

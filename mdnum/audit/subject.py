@@ -99,7 +99,7 @@ def differences(one: EnergyForces, other: EnergyForces) -> tuple[float, float]:
 def not_repeatable(
     how: str, energy: float, force: float, typical: float, kT: float, **values: Any
 ) -> Observed:
-    """Report that two evaluations of one structure differ. Rounding errors are only a warning.
+    """Report that two evaluations of one structure differ. Rounding differences are only a warning.
 
     Args:
         how: how the difference was discovered, as the name of a text variant.

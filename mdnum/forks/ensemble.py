@@ -1,4 +1,4 @@
-"""Measure properties of perturbed runs, and change programs to validate the test.
+"""Measure properties of perturbed runs, and change programs to validate the statistical test.
 
 Every property (feature) is a continuous function of the positions. Pairs are counted with hat functions and
 not in bins.
@@ -105,7 +105,7 @@ def pair_distances(
 def hats(
     distances: Float[np.ndarray, "pairs"], nodes: Float[np.ndarray, "nodes"]
 ) -> Float[np.ndarray, "hats"]:
-    """Count pair distances with hat functions: each contributes to two nodes.
+    """Count pair distances with hat functions. Each distance contributes to two nodes.
 
     The contribution to a node grows linearly as the distance approaches the node. A distance below the first
     node is counted at this node. No count jumps when a pair distance passes the last node.

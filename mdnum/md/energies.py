@@ -78,7 +78,7 @@ class Call:
     name: str = "energy function"
 
     def bare(self, parameters: Any, x: Array, neighbor: Any, given: Mapping[str, Array]) -> Any:
-        """Return the energy in the function's own units.
+        """Return the energy in the units of the energy function.
 
         Args:
             given: the keywords of the convention; for mdnum's own convention, "cell".
@@ -130,7 +130,7 @@ class Call:
 
 @jax.custom_jvp
 def _real_slope(x: Array, inverse: Array) -> Array:
-    """Return fractional coordinates that derivatives treat as real coordinates, as jax-md does."""
+    """Return fractional coordinates whose derivatives refer to real positions."""
     return x @ inverse
 
 

@@ -127,8 +127,7 @@ class ListBuilder(Protocol):
     def build(
         self, positions: Float[np.ndarray | Array, "atoms 3"], cell: Cell, r_list: float, slots: int
     ) -> tuple[Int[np.ndarray | Array, "slots atoms"], Int[np.ndarray | Array, "atoms"], int]:
-        """Return neighbor table, atom order and neighbor count. If the count exceeds `slots`, pairs are
-        missing."""
+        """Return table, atom order and neighbor count. If the count exceeds `slots`, pairs are missing."""
         ...
 
 
@@ -239,7 +238,7 @@ class VerletList:
         return max(SLOTS, int(np.ceil(slots / SLOTS)) * SLOTS)
 
     def consumed(self, positions, cell: Cell, reference, reference_cell: Cell) -> float:
-        """Return the used fraction of the skin. If it is above 1, pairs may be missing from the list.
+        """Return the fraction of the skin that is used up. Pairs may be missing if the fraction is above 1.
 
         Args:
             positions, cell: present state. reference, reference_cell: state when the list was built.

@@ -35,7 +35,7 @@ class Chain(NamedTuple):
     def act(
         self, kinetic: Number, freedom: int | Number, kT: Number, relaxation: Number, time: Number
     ) -> tuple[Number, Chain]:
-        """Advance the chain by a time. Return the velocity factor and the new chain.
+        """Advance the chain by a time. Return the scale factor of velocities and the new chain.
 
         Each of three substeps is the operator L_NHC of Tuckerman et al., J. Phys. A 39, 5629, 2006. The error
         is O(time⁵).
@@ -115,7 +115,7 @@ class NoseHooverChain(Integrator):
 def rescaled(
     key: Array, kinetic: Number, freedom: int, kT: Number, relaxation: Number, time: Number
 ) -> Number:
-    """Return the velocity factor of an exact stochastic step of the kinetic energy.
+    """Return the velocity scale factor of an exact stochastic step of the kinetic energy.
 
     Bussi, Donadio, Parrinello, J. Chem. Phys. 126, 014101 (2007), eqs. A7 and A8. Zero velocities stay zero.
 
@@ -139,7 +139,7 @@ class CSVR(Integrator):
 
     Bussi, Donadio, Parrinello, J. Chem. Phys. 126, 014101 (2007). The random numbers depend only on the
     random key and the step number. A resumed run continues the sequence of random numbers. The effective
-    energy (total energy minus heat) is conserved (eq. 15).
+    energy (total energy minus heat) is conserved (eq. 15 of the paper).
 
     Example:
         >>> mdnum.simulation(atoms, argon, cut, timestep=0.002, temperature=90, integrator="csvr",

@@ -72,7 +72,7 @@ class Hysteresis:
             )
 
     def margin(self, quantity, before):
-        """Return the distance to the current threshold, positive if the decision is "yes".
+        """Return the signed distance to the current threshold, positive if the decision is "yes".
 
         Args:
             quantity: computed value(s).
@@ -125,7 +125,7 @@ class Ledger:
 
     @property
     def ambiguous(self) -> Bool[np.ndarray, "flips"]:
-        """Whether each |margin| is within the error bound, so that rounding could move the flip."""
+        """True for flips that rounding could move: |margin| is within the error bound."""
         return np.abs(self.margin) <= self.bound
 
     def counts(self, steps: int) -> tuple[Int[np.ndarray, "steps"], Int[np.ndarray, "steps"]]:
@@ -135,6 +135,6 @@ class Ledger:
         return entered, left
 
     def jumps(self, steps: int) -> Float[np.ndarray, "steps"]:
-        """Return the sum of the energy jumps at each step."""
+        """Return the sum of the energy jumps of all flips at each step."""
         # bincount of nothing is a row of integers, whatever its weights
         return np.bincount(self.step, weights=self.jump, minlength=steps + 1).astype(np.float64)

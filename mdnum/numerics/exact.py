@@ -39,7 +39,7 @@ def _through_integers(x, zero):
 
 @jax.custom_jvp
 def fence(x: jax.Array, zero: jax.Array) -> jax.Array:
-    """Return x. XLA cannot fuse the operations before and after.
+    """Return x. XLA cannot fuse the operations before and after the fence.
 
     The bits of x are combined (exclusive-or) with a zero unknown to XLA. The fence also forces rounding to
     float16 and bfloat16 on a CPU.
@@ -67,7 +67,7 @@ def root(x: jax.Array) -> jax.Array:
     """Return the square root, correctly rounded on every device.
 
     On an H200 GPU, one float32 square root in six is wrong by one ulp. A float64 square root, rounded to
-    float32, is correct (Figueroa 1995, "When is double rounding innocuous?").
+    float32, is correctly rounded (Figueroa 1995, "When is double rounding innocuous?").
     """
     if x.dtype != jnp.float32 or jax.default_backend() == "cpu":
         return jnp.sqrt(x)

@@ -64,7 +64,7 @@ Vector = tuple[float, float, float]
 
 @dataclass(frozen=True)
 class Reach:
-    """Lattice vectors and largest coordinates of a box, for rounding bounds."""
+    """Lattice vectors and largest coordinates of a box, to bound rounding errors."""
 
     # vectors of the periodic axes in the order in which they are taken off, length
     lattice: tuple[Vector, ...] = ()
@@ -76,7 +76,7 @@ class Reach:
         return cls(tuple(_three(row) for row in lattice), _three(coordinate))
 
     def rounded(self) -> tuple[Float[np.ndarray, "3"], int]:
-        """Return the sum of |components| of all rounded results by axis, and their number.
+        """Return, by axis, the sum of |components| of all rounded results, and their number.
 
         The first subtraction gives d + n_1 a_1 + n_2 a_2 + n_3 a_3, with final value d and n in {-1, 0, 1}.
         Each further subtraction of a lattice vector removes one term n_k a_k.

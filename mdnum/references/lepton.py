@@ -1,7 +1,7 @@
 """LAMMPS as a reference for pair functions, by its pair style `lepton`.
 
-LAMMPS parses and differentiates an expression made from the function. Pairs, sums, energies and derivatives
-are thus computed by an independent program.
+LAMMPS parses and differentiates an expression made from the pair function. Pairs, sums, energies and
+derivatives are thus computed by an independent program.
 """
 
 from __future__ import annotations

@@ -143,7 +143,7 @@ def _usable_cell(cell: ndarray, pbc: ndarray) -> ndarray:
 
 
 def completed(cell: Vectors, pbc: Axes) -> Vectors:
-    """Return the cell with unit vectors, normal to the others, as nonperiodic vectors."""
+    """Return the cell. Nonperiodic vectors are replaced by unit vectors normal to the others."""
     if pbc.all():
         return cell
     free = np.flatnonzero(~pbc)

@@ -185,7 +185,7 @@ class CrossRecorder:
     def take(
         self, first: int, rows: int, a: PairFlips, b: PairFlips
     ) -> tuple[Int[np.ndarray, "rows"], CrossFlips]:
-        """Return the number of differing pairs by step, and the `CrossFlips`.
+        """Return the number of pairs with different decisions by step, and the `CrossFlips`.
 
         Args:
             first: step of the first row.
@@ -296,7 +296,7 @@ def separations(
     b: Float[np.ndarray, "rows 3 atoms"],
     others: Sequence[Cell] = (),
 ) -> Float[np.ndarray, "rows"]:
-    """Return the largest distance between positions in two runs by step (or NaN).
+    """Return, by step, the largest distance between an atom's positions in two runs (or NaN).
 
     Args:
         cells: the box, or one box for each row; distances are minimum-image distances.
@@ -312,7 +312,7 @@ def separations(
 
 
 def strains(cells: Sequence[Cell], others: Sequence[Cell]) -> Float[np.ndarray, "rows"]:
-    """Return the strain between two boxes, the largest relative change of length, by step."""
+    """Return, by step, the strain between two boxes (the largest relative change of length)."""
     by = np.array([cell.deformation(other) for cell, other in zip(cells, others, strict=True)])
     out, known = np.full(len(by), np.nan), np.flatnonzero(np.isfinite(by).all(axis=(1, 2)))
     # a rotation is no strain

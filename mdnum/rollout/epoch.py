@@ -224,8 +224,8 @@ def over_rows(
 ) -> tuple[Any, Any]:
     """Scan like `jax.lax.scan`, but only over the first `used` rows.
 
-    Buffers have the size of the longest segment, to compile one function. A loop over the whole buffer would
-    mostly visit empty rows. Outputs for unused rows of the buffers are zero.
+    Buffers have the size of the longest segment, so that one function is compiled. A loop over the whole
+    buffer would mostly visit empty rows. Outputs for unused rows of the buffers are zero.
     """
     first = jax.tree.map(lambda leaf: jax.ShapeDtypeStruct(leaf.shape[1:], leaf.dtype), rows)
     _, out = jax.eval_shape(step, carry, first)

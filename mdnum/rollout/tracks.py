@@ -158,7 +158,7 @@ class Track:
         return self._ahead[-1].last
 
     def until(self, last: int) -> Rows | None:
-        """Return further time steps up to `last`. None if there are none."""
+        """Return the time steps up to `last` that were not yet returned. None if there are none."""
         while not self._ahead or self.ready < last:
             if self.segment() is None:
                 break
@@ -171,7 +171,7 @@ class Track:
         return every[every.step <= last]
 
     def doubts(self, last: int) -> AmbiguousPairs:
-        """Return further ambiguous decisions up to step `last`."""
+        """Return the ambiguous decisions up to step `last` that were not yet returned."""
         every = AmbiguousPairs.concatenate(self._doubts)
         taken = every[every.step <= last]
         self._doubts = [every[every.step > last]]
@@ -180,7 +180,7 @@ class Track:
 
 
 def rows_of(simulation: Simulation, segment: Segment, frame: ReferenceFrame, failed: str) -> Rows:
-    """Convert recorded steps to the user's order, labels and axes."""
+    """Convert recorded time steps to the user's order of atoms, labels and axes."""
     x, v = (in_user_order(segment.rows_of(name), segment.table.order) for name in ("x", "v"))
     energy = segment.rows_of("potential") + segment.rows_of("kinetic")
     nearest = segment.rows_of("nearest").astype(np.float64)

@@ -56,7 +56,7 @@ class Answers(Generic[T]):
 
 
 def take(path: str | Path, layout: Layout) -> RunFolder:
-    """Open the folder of a command to resume. Other processes cannot write into the opened folder.
+    """Open the folder of a command that is to be resumed. Other processes cannot write into this folder.
 
     Raises:
         FolderError: the folder has no state of this command, another process writes it, or it was changed.

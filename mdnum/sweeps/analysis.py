@@ -141,7 +141,7 @@ def _along(
     reference: Setting,
     names: Sequence[str],
 ) -> dict[str, dict[str, Raw]]:
-    """Return the differences of settings from a reference, by measure and label."""
+    """Return the differences between settings and a reference setting, by measure and label."""
     found = {}
     for name in names:
         runs = results.values.get(name, {})
@@ -254,7 +254,7 @@ def _advice(
 
 
 def recommended(plan: Plan, advice: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
-    """Return the settings of all recommended and all converged values. Empty if equal.
+    """Return two settings: all recommended values, and all converged values. Empty if equal.
 
     The two settings show the combined effect of choices that were varied alone.
     """
@@ -281,7 +281,7 @@ def _together(
     means: Means, results: _Results, joint: Sequence[Setting],
     tolerances: Mapping[str, float],
 ) -> dict[str, Any]:  # fmt: skip
-    """Compare the settings of all recommended and all converged values."""
+    """Compare two settings: all recommended values, and all converged values."""
     setting, end = joint
     found = _along(means, results, {"": setting}, end, list(tolerances))
     one = compared_with_end(setting, "", found, tolerances, len(tolerances))

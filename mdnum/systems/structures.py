@@ -271,7 +271,7 @@ def _check_width(cell: Cell, r_cut: float, skin: float, length: str) -> None:
 
 
 def repeats(cell: Cell, r_list: float) -> str:
-    """Return the repeats along a, b and c that the minimum image needs."""
+    """Return how often the box is repeated along a, b and c for the minimum image."""
     return " x ".join(str(max(1, math.ceil(2 * r_list / width))) for width in cell.widths)
 
 
@@ -366,7 +366,7 @@ _LONGEST_HEAD = 1000
 
 
 def _from_extxyz(path: Path) -> Atoms | None:
-    """Read atoms from a file by `to_extxyz`. None for other formats."""
+    """Read atoms from a file that `to_extxyz` wrote. None for other formats."""
     from ase import Atoms
     from pyarrow import ArrowInvalid, csv
 

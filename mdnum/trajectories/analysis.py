@@ -111,7 +111,8 @@ class NeighborFlips(AnalysisBase):
     `Trajectory.other_box`), or None. `frames` and `times` list the analyzed frames. `FlipTable.frame` is an
     index into `frames` and `times`.
 
-    An error names the frame that cannot be read or is impossible. The results of all earlier frames are kept.
+    If a frame cannot be read or is impossible, the error names the frame. The results of all earlier frames
+    are kept.
 
     Args:
         universe_or_atomgroup: the atoms that form pairs.
@@ -380,9 +381,9 @@ class NeighborFlips(AnalysisBase):
 
 
 def _changed(before: Frame, after: Frame) -> float:
-    """Return the largest change of the distance of atoms k and k + 1 by transformations.
+    """Return the largest change that transformations make to the distance of atoms k and k + 1.
 
-    Shifts by lattice vectors and rotations do not count.
+    Shifts by lattice vectors and rotations do not count as changes.
     """
     if before is after:
         return 0.0

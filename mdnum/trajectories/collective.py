@@ -92,8 +92,9 @@ def spreads(x: Float[np.ndarray, "atoms 3"]) -> Float[np.ndarray, "3"]:
 def _flat(now: np.ndarray, before: np.ndarray, atoms: int, constant: bool) -> str | None:
     """Describe the plane, line or point into which all atoms collapsed, or None.
 
-    In a correct file, rippled sheets may become flat. A collapse is reported only if the thickness exceeded
-    the distance of neighbors before. If all atoms share a coordinate, a fifth of the extent is enough.
+    In a correct file, rippled sheets may become flat. A collapse is reported only if the earlier thickness
+    exceeded the distance of neighbors. If all atoms share a coordinate, a thickness of a fifth of the extent
+    is enough.
     """
     thin, middle, long = now <= _COLLAPSED * before
     if before[2] > 0 and (long if atoms > _FEW else now[2] == 0):

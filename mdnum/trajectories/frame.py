@@ -200,7 +200,7 @@ def far_out(
     bits: int = 64,
     before: Float[np.ndarray, "some 3"] | None = None,
 ) -> tuple[int, int, str] | None:
-    """Return the atom farthest from the others if this is impossible (arguments as in `FrameCheck`).
+    """Return the atom that is impossibly far from the others (arguments as in `FrameCheck`).
 
     The previous frame also gives the system size, since the current frame may be damaged.
 
@@ -235,9 +235,9 @@ def far_out(
 
 
 def leap(before: Frame, now: Frame, atoms: AtomIndices = None) -> tuple[int, float] | None:
-    """Return the atom that moved farthest if this displacement is impossible.
+    """Return the atom that moved farthest if its displacement is impossibly large.
 
-    A jump by a lattice vector does not count.
+    A jump by a lattice vector does not count as a displacement.
 
     Returns:
         (the atom, the length of its displacement); None if no displacement is impossible.
@@ -263,5 +263,5 @@ def furthest(x: Float[np.ndarray, "atoms 3"]) -> float:
 
 
 def _named(at: Any, atoms: AtomIndices) -> int:
-    """Convert the index among selected atoms to the number in the file."""
+    """Convert the index of a selected atom to its number in the file."""
     return int(at if atoms is None else atoms[at])

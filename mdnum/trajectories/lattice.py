@@ -1,8 +1,8 @@
 """Reduction of lattice vectors, bins of atoms, and the search for pairs.
 
-Lattice vectors are reduced first, so that skewed boxes are searched quickly. Decisions use the length of (x_j
-- x_i) + s_0 a_0 + s_1 a_1 + s_2 a_2, in this order, with i < j. Here, x are stored coordinates, s integers
-and a reduced vectors. A decision does not depend on the search algorithm.
+Lattice vectors are reduced first, so that skewed boxes are searched quickly. Pair decisions use the length of
+(x_j - x_i) + s_0 a_0 + s_1 a_1 + s_2 a_2, in this order, with i < j. Here, x are stored coordinates, s
+integers and a reduced vectors. A pair decision does not depend on the search algorithm.
 
 For a search, the reduced box is divided into bins. Along a nonperiodic direction, the number of bins is
 limited. For each bin, the atoms of all nearby bins and their images are gathered. Each atom of the bin is
@@ -172,7 +172,7 @@ def near_squares(x, i, j, lattice, y, squares):
 
 @njit
 def image_square(x, i, j, rank, lattice):
-    """Return the squared distance from i to an image of j. `rank` counts nearer images.
+    """Return the squared distance from atom i to an image of atom j. `rank` counts nearer images.
 
     Either i < j, or i == j (opposite images count once). If no image of j has the given rank, the result is
     inf.
@@ -275,7 +275,7 @@ class SearchLimits(NamedTuple):
 
     @classmethod
     def of(cls, radii: Float[np.ndarray, "species species"], kind: int, band: float) -> SearchLimits:
-        """Return the squares of the radii minus `band` and plus `band`."""
+        """Return the squares of the cutoff radii minus `band` and plus `band`."""
         low = np.where(radii >= 0, np.maximum(radii - band, 0.0) ** 2, np.inf)
         high = np.where(radii >= 0, (radii + band) ** 2, -1.0)
         return cls(kind, low, high, float((radii.max(initial=0.0) + band) ** 2))
@@ -294,7 +294,7 @@ class Candidates(NamedTuple):
 
     @classmethod
     def room(cls, certain: int, open: int) -> Candidates:
-        """Allocate buffers for decided pairs and for open pairs."""
+        """Allocate buffers for decided pairs and for pairs still to be decided."""
         i, j, i_open, j_open, code = (np.empty(n, np.int32) for n in (certain, certain, open, open, open))
         return cls(i, j, i_open, j_open, code, np.empty(open), np.zeros(3, np.int64))
 
@@ -407,7 +407,7 @@ def wrap(x, lattice, bins, step):
 
 @njit
 def _sorted_by_bin(bin_of, chosen, total):
-    """Sort atoms by bin. Return the first index of each bin, and the atoms."""
+    """Sort atoms by bin. Return the first index of each bin, and the sorted atoms."""
     start = np.zeros(total + 1, np.int64)
     count = 0
     for i in range(bin_of.shape[0]):

@@ -1,7 +1,8 @@
 """Pairs inside a cutoff that a neighbor list lacks, and for how long.
 
 A list is incomplete if the skin was exceeded, a buffer overflowed, or images are not supported. The program
-then omits the interactions of the missing pairs. Pairs at the cutoff (within the error) are not counted.
+then omits the interactions of the missing pairs. Missing pairs whose distance equals the cutoff within its
+error are not counted.
 """
 
 from __future__ import annotations
@@ -168,7 +169,7 @@ def arrays_of(neighbors: Any, atoms: int) -> list[np.ndarray]:
 
 
 class ListCheck:
-    """Comparison of a neighbor list with the true pairs at each frame."""
+    """Comparison of a neighbor list with the pairs inside the cutoff at each frame."""
 
     def __init__(self, rule: Rule) -> None:
         self._rule = rule

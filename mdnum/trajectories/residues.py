@@ -86,7 +86,7 @@ class ByResidue:
         return first, second
 
     def tracker(self, rule: Rule, species: Sequence[str] | None, bound: float = 0.0) -> ResidueTracker:
-        """Return a tracker of residue contacts for a rule for atoms."""
+        """Return a tracker of residue contacts, given a membership rule for atoms."""
         return ResidueTracker(rule, self, species, bound)
 
 
@@ -104,8 +104,8 @@ def left_out(table: AtomTable) -> tuple[Bool[np.ndarray, "atoms"], Bool[np.ndarr
 class ResidueTracker:
     """Tracker of contacts between residues, used like `Tracker`.
 
-    Pairs of atoms within one residue are ignored. `near` counts atom pairs at the cutoff, within rounding.
-    Two residues may have several such pairs. The attribute `min_margin` is always inf.
+    Pairs of atoms within one residue are ignored. `near` counts atom pairs whose distance equals the cutoff
+    within rounding. The attribute `min_margin` is always inf.
 
     Args:
         rule: membership rule for atoms.
@@ -138,7 +138,7 @@ class ResidueTracker:
 
     @property
     def near(self) -> int:
-        """Number of atom pairs at the cutoff, within the error, at the last frame."""
+        """Number of atom pairs whose distance equals the cutoff within rounding, at the last frame."""
         return self._atoms.near
 
     @property
@@ -182,7 +182,7 @@ class ResidueTracker:
         return Members(i, j, np.zeros_like(i), self._closest(self._last, i, j)[0])
 
     def _closest(self, frame: Frame, i: np.ndarray, j: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return distance and threshold of the atom pair with the largest margin by residue pair."""
+        """Return, by residue pair, distance and threshold of the atom pair with the largest margin."""
         placed, found = self._placed(frame), np.full((2, len(i)), np.inf)
         for begin in range(0, len(i), _TOGETHER):
             part = slice(begin, begin + _TOGETHER)
@@ -220,7 +220,7 @@ def _by_residue(atoms: np.ndarray | None, of: np.ndarray, count: int) -> tuple[n
 
 @dataclass(frozen=True)
 class Occupancy(Columns):
-    """Sparse matrix of the fraction of frames in contact, by residues i and j."""
+    """Sparse matrix: the fraction of frames in which residues i and j are in contact."""
 
     i: Int[np.ndarray, "pairs"]  # the pair
     j: Int[np.ndarray, "pairs"]
@@ -252,7 +252,7 @@ class ResidueNames(Columns):
 def contacts_over_time(
     stays: Contacts, residues: int, frames: int
 ) -> tuple[Int[np.ndarray, "moments"], Float[np.ndarray, "residues moments"]]:
-    """Return the first frame of each interval, and mean contacts of each residue."""
+    """Return the first frame of each interval, and each residue's mean number of contacts."""
     edges = np.unique(np.linspace(0, frames, min(frames, MOMENTS) + 1).astype(np.int64))
     found = np.zeros((residues, len(edges) - 1))
     for k, (low, high) in enumerate(pairwise(edges)):

@@ -349,7 +349,7 @@ def compared(before: NeighborRows, now: NeighborRows, room: int) -> Changed:
 
 @njit
 def _compared(old, new, made):
-    """Write the differing pairs into the buffer. Return their total number."""
+    """Write pairs whose decision differs between two frames into the buffer. Return their total number."""
     atoms = old.first.shape[0]
     seen = np.zeros((atoms, 2), np.int32)
     total, room = 0, made.i.shape[0]
@@ -379,9 +379,9 @@ def image_distances(
     rank: Int[np.ndarray, "pairs"],
     directed: bool = False,
 ) -> Float[np.ndarray, "pairs"]:
-    """Return the distance from i to an image of j. `rank` counts nearer images.
+    """Return the distance from atom i to an image of atom j. `rank` counts nearer images.
 
-    If no such image of j exists, the distance is inf. A directed rule counts opposite images separately.
+    If atom j has no such image, the distance is inf. A directed rule counts opposite images separately.
     """
     out = np.empty(len(i))
     rank = np.where(i == j, rank // 2, rank) if directed else rank
@@ -405,7 +405,7 @@ def _image_distances(x, lattice, i, j, rank, out):
 
 
 def ranks(i: Int[np.ndarray, "pairs"], j: Int[np.ndarray, "pairs"]) -> Int[np.ndarray, "pairs"]:
-    """Number the entries with equal (i, j) from 0."""
+    """Return the numbers 0, 1, 2, ... of entries with equal (i, j)."""
     new = np.ones(len(i), bool)
     new[1:] = (i[1:] != i[:-1]) | (j[1:] != j[:-1])
     at = np.flatnonzero(new)

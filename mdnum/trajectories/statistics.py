@@ -85,7 +85,7 @@ class Survival:
     longest: int  # frames for which any was followed: nothing is known beyond
 
     def at(self, share: float) -> int | None:
-        """Return the shortest duration that at most a fraction `share` exceeds, or None."""
+        """Return the shortest duration that at most a fraction `share` of contacts exceeds, or None."""
         below = np.flatnonzero(self.share <= share)
         return int(self.frames[below[0]]) if len(below) else None
 
@@ -327,7 +327,7 @@ class Busiest(Columns):
 
 @dataclass(frozen=True)
 class Residues(Sums):
-    """Flips of each group of atoms (such as a residue): within it, and with others."""
+    """Numbers of flips within each group of atoms (such as a residue), and with other atoms."""
 
     between: Int[np.ndarray, "groups"]
     within: Int[np.ndarray, "groups"]
@@ -374,7 +374,7 @@ class Statistics(Sums):
     def of(
         cls, history: History, labels: Labels, directed: bool, window: int, before: Statistics | None = None
     ) -> tuple[Statistics, Contacts]:
-        """Add statistics of `history` to `before`. Return the sum and the contacts.
+        """Add statistics of `history` to `before`. Return the sum and the contacts in `history`.
 
         A flip reversed within `window` frames is counted as chatter. A contact with a gap of up to `window`
         frames counts as one contact.

@@ -77,8 +77,8 @@ def contacts(run: BallRun) -> dict[str, np.ndarray]:
 def decisions(run: BallRun) -> dict[str, np.ndarray]:
     """Return a table of the solver's stop decisions.
 
-    All decisions are included for one solver with residual histories. If not, only the last two decisions of
-    each call are included.
+    All decisions are included for one solver with residual histories. In other cases, only the last two
+    decisions of each solver call are included.
     """
     rule = rule_of(run)
     if rule is None:
@@ -142,7 +142,7 @@ def heights(run: BallRun) -> dict[str, np.ndarray]:
 
 
 def separations(name: str, found: BallDifference) -> dict[str, np.ndarray]:
-    """Return a table of the largest height difference from the main run by step."""
+    """Return, by step, the largest height difference between a variant and the main run."""
     size = len(found.separation)
     return {"variant": np.full(size, name), "step": np.arange(size), "separation": found.separation}
 

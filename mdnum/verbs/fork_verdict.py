@@ -76,7 +76,7 @@ def _headline(view: View) -> tuple[str, dict[str, Any]]:
 
 
 def agreeing(view: View) -> str:
-    """Return a phrase on how many repeats split later with imposed decisions."""
+    """Return a phrase on how many repeats diverge later if decisions are imposed."""
     said: list[str] = []
     for name in ("count", "count_other"):
         if count := view.summary.get(name):
@@ -158,7 +158,7 @@ def _findings(view: View) -> Iterator[Finding]:
 
 
 def must_hold(row: Mapping[str, Any]) -> Finding:
-    """Return the finding on a choice that should not change bits, but did."""
+    """Return the finding on a numerical choice that changed bits although it should not."""
     values: dict[str, Any] = {name: row.get(name) for name in ("choice", "difference", "first_bit", "fork")}
     return TEXTS.finding("MUST_HOLD_FORKED", *["fork"] * (row.get("fork") is not None), **values)
 
@@ -181,7 +181,7 @@ def judge_screen(view: View) -> Verdict:
 
 
 def judge_compare(view: View) -> Verdict:
-    """Return the verdict on two folders: the step of divergence and its causes."""
+    """Return the verdict on the runs of two folders: the step of divergence and its causes."""
     summary = view.summary
     causes = summary["causes"]
     values = {name: summary[name] for name in ("steps", "first_bit", "fork")}

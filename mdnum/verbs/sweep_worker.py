@@ -33,7 +33,7 @@ class Task:
 
 
 def enough(result: Mapping[str, Any] | None, measures: Mapping[str, str]) -> bool:
-    """True if a result is complete, or would fail again."""
+    """True if a result is complete, or if another attempt would fail again."""
     if result is None:
         return False
     if result["status"] == "failed":
@@ -43,13 +43,13 @@ def enough(result: Mapping[str, Any] | None, measures: Mapping[str, str]) -> boo
 
 
 def _missing(result: Mapping[str, Any] | None, measures: Mapping[str, str]) -> list[str]:
-    """Return the measures that are not stored, or are from other source code."""
+    """Return the measures that are not stored, or were computed by other source code."""
     stored = {} if result is None else result["measures"]
     return [name for name, at in measures.items() if stored.get(name, {}).get("digest") != at]
 
 
 def work(task: Task) -> list[dict[str, Any]]:
-    """Compute the missing points of a task. Return address and status of each.
+    """Compute the missing points of a task. Return the address and the status of each point.
 
     The status is "computed" (now), "there" (stored before), "busy" (in another process), or "full" (not
     writable), with the reason.

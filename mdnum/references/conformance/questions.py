@@ -122,7 +122,7 @@ def _outside() -> Named:
 def _across_walls() -> ndarray:
     """Return pairs along x, just less than r_cut apart, near a multiple of r_cut.
 
-    After rounding to float32, the partner may be two grid cells away.
+    After rounding to float32, the atoms of a pair may be two grid cells apart.
     """
     hairs = (1e-6, 5.5e-8, 1e-9, 3e-12, 2e-16)
     pairs = []
@@ -174,7 +174,7 @@ def vast() -> Iterator[Case]:
 
 
 def lattice(edge: int, seed: int = 0) -> Case:
-    """Return atoms on a cubic lattice with vacancies, in random order and images.
+    """Return atoms on a cubic lattice with vacancies, in random order and random periodic images.
 
     The neighbors of each atom are on the 26 sites around it. Neighbors are found from site indices, without
     rounding.
@@ -308,7 +308,7 @@ def _images(cell: ndarray, pbc: Pbc, r_cut: float) -> int:
 def _positions(
     place: str, count: int, cell: ndarray, pbc: ndarray, r_cut: float, rng: np.random.Generator
 ) -> tuple[ndarray, float]:
-    """Return positions and a cutoff. The cutoff is a pair distance for "at the cutoff"."""
+    """Return positions and a cutoff. For "at the cutoff", the cutoff equals a pair distance."""
     full = completed(cell, pbc)
     # free axes have vectors of length 1, which would be no room
     room = np.where(pbc, 1.0, np.maximum(1.0, 3.0 * r_cut / np.linalg.norm(full, axis=1)))
