@@ -227,9 +227,10 @@ def boundaries(
 
     The system is run at every grid value of the parameter. A grid interval is bisected if the decisions at
     its ends differ. Bisection stops at adjacent floats. If decisions also change in the other half, that half
-    is searched later. The search goes from low to high parameter values. If there are more boundaries than
-    requested, the highest are missing. All runs use the program of a normal run. The cutoff radius becomes an
-    argument if it varies. A new process repeats the runs on both sides of every boundary.
+    is searched later. Boundaries that cancel within a grid interval are missed. The search goes from low to
+    high parameter values. If there are more boundaries than requested, the highest are missing. All runs use
+    the program of a normal run. A varied cutoff radius becomes an argument. A new process repeats the runs on
+    both sides of every boundary.
 
     Args:
         steps: last step; default the system's own. For arguments not listed here see `mdnum.fork_map`.

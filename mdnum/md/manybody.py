@@ -32,8 +32,8 @@ _UNKNOWN = Smoothness(-1, float("nan"), float("nan"))
 class ManyBody(eqx.Module):
     """Base class of potentials whose energy is not a sum over pairs.
 
-    The neighbor list contains only pairs inside the cutoff. Neighbor indices equal to the number of atoms are
-    padding. Every potential also tests r < r_cut, so a neighbor list may have a skin.
+    In a run, the neighbor list contains only pairs inside the cutoff. Neighbor indices equal to the number of
+    atoms are padding. Every potential also tests r < r_cut, so a neighbor list may have a skin.
 
     Attributes:
         pbc: which axes are periodic.

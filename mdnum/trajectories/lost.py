@@ -92,7 +92,7 @@ class FrameMotion:
 
 @dataclass(frozen=True)
 class LostFlips:
-    """Estimate of the flips missed between frames, as a fraction of all flips."""
+    """Estimate of the flips missed between frames, as a fraction of the true number of flips."""
 
     # "none_lost" (every second frame alone would lose no flip), "estimate"; or why there is no number:
     # "rounding" (the file's digits may have made what thinning loses), "open" (too wide a range fits)
