@@ -225,7 +225,7 @@ def _of_frames(first: RunFolder, second: RunFolder, where: str) -> FolderFork:
 
 
 def choices(programs: list[Difference]) -> list[str]:
-    """Return the choices in which two systems differ, given the differing keys.
+    """Return the numerical choices in which two systems differ, given the differing keys.
 
     All dtypes count as one numerical choice. A cutoff and its parameters count as one choice."""
     keys = [key for key, _, _ in programs]
@@ -356,7 +356,7 @@ def _starts(first: RunFolder, second: RunFolder, programs: list[Difference], whe
 
 
 def _same_system(one: Any, other: Any) -> Iterator[tuple[bool, str]]:
-    """Compare two sets of atoms. Yield for each property whether the two sets agree, and a message."""
+    """Compare two sets of atoms. For each property, yield whether the two sets agree, and a message."""
     yield len(one) == len(other), f"numbers of atoms differ, {len(one)} and {len(other)}"
     symbols = [each.get_chemical_symbols() for each in (one, other)]
     yield symbols[0] == symbols[1], "species or their order differ"

@@ -209,8 +209,8 @@ def density(
     """Estimate the weighted pair density at the cutoff, summed over frames.
 
     The delta function is replaced by a parabolic kernel of finite width. The bias contains only even powers
-    of the width. Extrapolation from three widths (w, w/2, w/4) removes the second and fourth powers. The
-    result uses the widest kernels that agree with all narrower kernels. Two extrapolations agree if they
+    of the kernel width. Extrapolation from three widths (w, w/2, w/4) removes the second and fourth powers.
+    The result uses the widest kernels that agree with all narrower kernels. Two extrapolations agree if they
     differ by at most two standard errors.
 
     Args:

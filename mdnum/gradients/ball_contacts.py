@@ -37,12 +37,12 @@ _NARROW = 1e-6
 
 
 def _moving(x: Any) -> Any:
-    """Return zero with the derivative of x."""
+    """Return zero, with the same derivative as x."""
     return x - lax.stop_gradient(x)
 
 
 class FixedPointRule(eqx.Module):
-    """Derivative of the contact's fixed point, not of its iterations.
+    """Derivative of the fixed point of a contact, not of the iterations.
 
     For a ball in contact, y ← G(y) = y + gain max(0, -y) approaches 0 from below. At y = 0, dG/dy is
     discontinuous. The rule uses the derivative of G for y < 0. Implicit differentiation, (1 - dG/dy) dy =
@@ -81,8 +81,8 @@ class _Settled(eqx.Module):
 class Implicit(BallMethod):
     """Gradient method: derivative of the fixed point of the contact.
 
-    The loss uses the executed iterations. The derivative is that of their limit. For the gain k, `unrolled`
-    gives a nonzero derivative, an artifact of the tolerance.
+    The loss uses the executed iterations. The derivative is that of the limit of the iterations. For the gain
+    k, `unrolled` gives a nonzero derivative, an artifact of the tolerance.
     """
 
     regularization: float = 0.0  # added to 1 - dG/dy, for a gain too small to divide by
@@ -152,7 +152,7 @@ class SoftImpact(eqx.Module):
     slow: Any  # in velocity, of the passage, m/s
 
     def acceleration(self, y, v, free, contact, r):
-        """Return the acceleration by control, gravity and spring. The contact decision is not used."""
+        """Return the acceleration due to control, gravity and spring. The contact decision is not used."""
         depth = self.eps * jax.nn.softplus(-y / self.eps)
         share = self.restitution**2
         return free + self.k * depth * (share + (1 - share) * jax.nn.sigmoid(-v / self.slow))

@@ -140,7 +140,7 @@ class Method:
         return None
 
     def __call__(self, problem: Any, names: Sequence[str], progress: Progress | None = None) -> Gradient:
-        """Compute the gradient. A complex loss is treated in two parts.
+        """Compute the gradient. For a complex loss, real and imaginary parts are differentiated in turn.
 
         Raises:
             InputError: the method does not apply to this problem, or a parameter does not exist.

@@ -209,7 +209,7 @@ class MTK(Barostat):
         return 0.5 * self.inertia(masses) * jnp.sum(jnp.square(extra.rate)), 6 if self.anisotropic else 1
 
     def _pushed(self, motion, extra, at, time):
-        """Return the state after pressure and kinetic energy acted on the box."""
+        """Return the state after pressure and kinetic energy acted on the box for a time."""
         heat = trace(motion) / self.freedom(at.masses)
         push = self.excess(motion, at) + heat * unit(extra.rate)
         # of an isotropic box the three directions together
@@ -269,11 +269,11 @@ class CellRescaling(Barostat):
     """Integrator for the isothermal-isobaric ensemble: first-order stochastic cell rescaling with CSVR.
 
     In the middle of the drift, an Euler step changes the square root of the volume. The noise of the square
-    root does not depend on the volume. Velocities are scaled inversely (Bernetti, Bussi, J. Chem. Phys. 153,
-    114107, 2020, section II C). In a full box, the traceless strain also changes (del Tatto, Raiteri,
-    Bernetti, Bussi, Applied Sciences 12, 1139, 2022). The noise of the strain uses the geometric mean of old
-    and new volume. Step probabilities give an effective energy, the total energy minus heat and work. The
-    effective energy is conserved within the time-step error.
+    root does not depend on the volume. Velocities are scaled inversely to the box (Bernetti, Bussi, J. Chem.
+    Phys. 153, 114107, 2020, section II C). In a full box, the traceless strain also changes (del Tatto,
+    Raiteri, Bernetti, Bussi, Applied Sciences 12, 1139, 2022). The noise of the strain uses the geometric
+    mean of old and new volume. Step probabilities give an effective energy, the total energy minus heat and
+    work. The effective energy is conserved within the time-step error.
 
     Example:
         >>> mdnum.simulation(atoms, argon, cut, timestep=0.002, temperature=90, pressure=0.0,
@@ -313,7 +313,7 @@ class CellRescaling(Barostat):
         return root, (2 * part + self.kT) / root, excess - part * unit(excess)
 
     def _shear(self, root, after):
-        """Return the mobility of a traceless strain. Old and new √V enter symmetrically."""
+        """Return the mobility of a traceless strain. The mobility is symmetric in old and new √V."""
         return 4 / 3 * self._mobility / (root * after)
 
     def finish(self, v, extra, at, time):

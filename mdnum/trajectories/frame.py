@@ -120,7 +120,7 @@ class FrameCheck:
         return frame
 
     def _wrong(self, frame: Frame) -> Iterator[tuple[str, str]]:
-        """Yield (problem, remedy) for each failed check."""
+        """Yield (problem, remedy) for each failed check of a frame."""
         atoms = self.atoms
         self.pbc = pbc = frame.box.pbc if self.pbc is None else self.pbc
         self.labels = labels = frame.labels if self.labels is None else self.labels

@@ -82,7 +82,7 @@ def ball_history(world: World, start: BallState, steps: int) -> BallRun:
 
 
 class _ExactBall:
-    """State of the balls in exact numbers, with the time step."""
+    """State of the balls in exact numbers, with a method for one time step."""
 
     def __init__(self, world: World, start: BallState):
         contact, scheme = world.contact, world.integrator
