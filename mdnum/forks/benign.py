@@ -303,7 +303,7 @@ def choose(windows: Sequence[Window], name: str) -> Window:
     )
     raise InputError(
         f"after {steps} steps, the effects of the deliberate changes cannot be distinguished from those of "
-        f"rounding errors. The test came closest at step {best.step}: {missed}",
+        f"rounding errors. The two kinds of effects differed most clearly at step {best.step}: {missed}",
         where=name,
         remedy=(
             "Compare at an earlier step, before the runs of the ensemble diverge, or start from a fluid "

@@ -92,7 +92,7 @@ def tangents(
     if not isinstance(force, PairForce):
         raise InputError(
             "pair decisions cannot be imposed on a many-body potential",
-            remedy="Linearize a system with a pair potential",
+            remedy="Use a system with a pair potential",
         )
     dtype, clock = simulation.policy.dtype("state"), _CLOCK * float(simulation.integrator.timestep)
     shift = 0.0
@@ -243,8 +243,8 @@ class Lyapunov:
     def steps_to(self, start: float, end: float) -> float | None:
         """Return the step at which a displacement has grown from one length to another.
 
-        The displacement grows like the tangent during the run, and exponentially after the run. The result is
-        None if a displacement without chaos does not reach `end` during the run.
+        During the run, a displacement grows like the tangent vector of the linearized run; later, it grows
+        exponentially. Return None if a displacement without chaos does not reach `end` during the run.
 
         Args:
             start: largest displacement of an atom at the start, length; for example one rounding unit.

@@ -377,7 +377,7 @@ class StretchReversal:
             raise InputError(
                 "the gradient can include the effect of flips only for a pair potential, with an energy that "
                 "is a sum over the pairs of the neighbor list",
-                remedy="For a many-body potential, use the gradient method symmetric",
+                remedy="For a many-body potential, use the “symmetric” gradient method",
                 where=simulation.name,
             )
         if simulation.integrator.moves_cell:

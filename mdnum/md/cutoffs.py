@@ -156,7 +156,7 @@ def check(cutoff: type[Cutoff] | Cutoff) -> None:
         ends = [_ends(made, power) for power in (1, 3)]
     if made.smoothness < _ORDERS and not any(ends):
         after = _DERIVATIVES[max(made.smoothness + 1, 0)]
-        raise ValueError(f"smoothness {made.smoothness} of the cutoff is too low: its {after} is continuous")
+        raise ValueError(f"smoothness {made.smoothness} is too low: even the cutoff’s {after} is continuous")
 
 
 def _ends(made: Cutoff, power: int) -> bool:

@@ -60,7 +60,7 @@ def read_setfl(path: Path, symbols: Sequence[str] = ()) -> Setfl:
         n_rho, n_r = int(first), int(second)
     except (IndexError, ValueError) as error:
         raise InputError(
-            f"the file is not a setfl table: lines 4 and 5 must name the elements and the grids ({error})",
+            f"this is not a setfl table: line 4 must list elements, line 5 grid sizes and spacings ({error})",
             where=where,
             remedy="Give a file in the eam/alloy format of LAMMPS",
         ) from error

@@ -184,5 +184,5 @@ def named(
     made, sets = _SETS[kind]
     if parameters not in sets:
         known = f"{'sets are' if len(sets) > 1 else 'set is'} {' and '.join(sets)}"
-        raise InputError(f"{kind} has no parameter set called {parameters!r}; the known {known}")
+        raise InputError(f"{kind} has no parameter set called {parameters!r}; the available {known}")
     return made(**sets[parameters], pbc=pbc)

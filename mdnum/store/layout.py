@@ -61,7 +61,7 @@ class Layout:
         if len(self.further) > _MOST_COLUMNS:
             raise ValueError(f"the list `further` is too long: {self.further[:100]!r}")
         if len(self.tables) > _MOST_TABLES or not all(map(_TABLE.fullmatch, self.tables)):
-            raise ValueError(f"the layout has too many tables or an invalid name: {list(self.tables)[:3]}")
+            raise ValueError(f"the layout has too many or wrongly named tables: {list(self.tables)[:3]}")
         _ = self._columns
         for table, texts in (self.described or {}).items():
             for column, said in texts.items():

@@ -278,7 +278,7 @@ class CutoffTable(TomlTable):
         if self.radius is not None and self.in_sigma is not None:
             raise ValueError("the cutoff radius is given twice, by radius and by in_sigma; remove one key")
         if self.base is None and not self.pairs:
-            raise ValueError("no cutoff radius was given; add the key radius or in_sigma, or the table pairs")
+            raise ValueError("no cutoff radius was given; add “radius” or “in_sigma”, or the table “pairs”")
         if self.onset is None:
             return self
         if not self.switches:

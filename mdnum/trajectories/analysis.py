@@ -444,7 +444,7 @@ def _rules_of(r_cut: Any, rule: Rule | Sequence[Rule] | None) -> list[Rule]:
     if not rules:
         raise InputError(
             "no cutoff or other rule for neighbors was given",
-            remedy="Give r_cut=8.5 (in Å), a list of radii, or a rule of mdnum.trajectories.rules",
+            remedy="Give r_cut=8.5 (in Å), a list of radii, or a rule from mdnum.trajectories.rules",
         )
     for one in rules:
         if not isinstance(one, Rule):

@@ -113,7 +113,7 @@ def fork_map(
     loaded = opened(system, keep.get("overrides"))
     if isinstance(loaded, BallSystem):
         if loss is not None:
-            raise InputError("the loss of a ball is taken from its system file", remedy="Omit the loss")
+            raise InputError("the loss of a ball comes from its system file", remedy="Give no loss function")
         loaded = loaded if steps is None else loaded.for_steps(steps)
         last, kind = last_step(loaded, steps), str(loaded.spec.loss.kind)
         lost = kind.replace("-", " "), "m²" if kind == "residual-penetration" else "m"

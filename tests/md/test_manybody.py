@@ -252,8 +252,8 @@ def test_a_broken_table_is_refused_in_one_line(tmp_path, change, message):
     [
         (lambda: made_eam(COPPER, ["Cu", "Al"]), "is for Cu, .*contains Al"),
         (lambda: made_eam(COPPER.with_name("none.alloy")), "potential table not found"),
-        (lambda: tetrahedral.named("tersoff", "Ge"), "known sets are Si and Si-1989"),
-        (lambda: tetrahedral.named("stillinger-weber", "Ge"), "known set is Si"),
+        (lambda: tetrahedral.named("tersoff", "Ge"), "available sets are Si and Si-1989"),
+        (lambda: tetrahedral.named("stillinger-weber", "Ge"), "available set is Si"),
     ],
 )
 def test_another_element_and_a_missing_table_are_refused(make, message):
