@@ -6,7 +6,7 @@ also reported. No version is assumed correct.
 Error bounds in mdnum assume that +, -, *, / and sqrt are correctly rounded. Sums must not be reordered. On
 CPUs, XLA rounds correctly and does not reorder sums. XLA does contract a*b+c and rewrite divisions by
 constants. Contractions and rewritten divisions change the last bits of results. Two builds of a program may
-therefore decide differently on a pair at the cutoff, within the error bound.
+therefore decide differently on a pair very close to the cutoff.
 """
 
 from __future__ import annotations

@@ -193,7 +193,7 @@ def near_box(typingctx: Any, atoms: Any, shift: Any, box: Any, reach: Any, out: 
 
 @intrinsic
 def near_atom(typingctx: Any, atom: Any, atoms: Any, low: Any, high: Any) -> Any:
-    """Return bit masks of atoms by squared distance: below `low`, and below `high`."""
+    """Return bit masks of the atoms with squared distance from `atom` below `low`, and below `high`."""
 
     def generate(context: Any, builder: Any, signature: Any, args: Any) -> Any:
         atom, atoms, low, high = args

@@ -85,7 +85,7 @@ def _labeled(atoms: Atoms, origin: str) -> Atoms:
 
 
 class _Builder:
-    """Builds a test structure for a calculator. Keeps the best structure so far."""
+    """Builder of a test structure for a calculator. The best structure so far is kept."""
 
     def __init__(self, loaded: LoadedCalculator, meter: Meter):
         self.name, self.calculator, self.meter = loaded.name, loaded.make(), meter
@@ -133,7 +133,7 @@ class _Builder:
         return self._mixed(made)
 
     def _first(self, symbols: Sequence[str], paired: bool = True) -> Atoms | None:
-        """Return a crystal of the first usable element. If `paired`, a pair gives the cutoff."""
+        """Return a crystal of the first usable element. If `paired`, a pair of particles gives the cutoff."""
         for symbol in symbols:
             subject = self.about(Atoms(symbol, [(0, 0, 0)]))
             with subject.trying():

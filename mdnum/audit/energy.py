@@ -319,7 +319,7 @@ class EnergyBalance:
 
     @property
     def filled(self) -> Steps:
-        """Unexplained energy change of each step without jumps, eV. Unmeasured steps have the mean."""
+        """Unexplained energy change of each step without jumps, eV. Unmeasured steps get the mean change."""
         left = self.rest - self.elsewhere
         return np.where(np.isnan(left), np.nanmean(left), left)
 

@@ -33,7 +33,7 @@ STRUCTURES = "structures"  # where structures are kept that show a finding
 def load_calculator(words: str) -> LoadedCalculator:
     """Find the named calculator. One object is created at once, so that errors appear immediately.
 
-    A Python file is executed again for each calculator object. Two objects thus share no arrays.
+    A Python file is executed again for each calculator object. Two calculator objects thus share no arrays.
 
     Args:
         words: `package.module:Class(argument=value)` with literals as arguments; a Python file in which

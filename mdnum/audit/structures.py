@@ -1,4 +1,4 @@
-"""Structures of an audit: read from a file, or two particles."""
+"""Structures for an audit: a structure from a file, or two particles."""
 
 from __future__ import annotations
 
@@ -108,7 +108,7 @@ class Pair:
         return np.linalg.norm(moved - self.first.positions[:, None], axis=2).ravel()[1:]
 
     def curve(self, subject: CalculatorSubject) -> Curve:
-        """Energy by distance, and the force on the second particle. A repulsive force is positive."""
+        """Return a function for energy and force on the second particle. A repulsive force is positive."""
 
         def at(distance: float) -> tuple[float, float]:
             energy, forces = subject.both(self.at(distance))

@@ -277,7 +277,7 @@ def _bounced(p: Parameters, t: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _arc(p: Parameters, s: complex, tau):
-    """Return height and velocity a time tau after a contact began with speed s."""
+    """Return height and velocity at time tau after the beginning of a contact with speed s."""
     k, half, deep = p["k"], p["damping"] / 2, p["gravity"] / p["k"]
     w = np.sqrt(k - half * half)
     fade, cosine, sine = np.exp(-half * tau), np.cos(w * tau), np.sin(w * tau) / w

@@ -44,7 +44,7 @@ class Reason(IntEnum):
 
 
 class Solve(NamedTuple):
-    """Record of one call of an iterative solver. One entry per ball if each ball stops separately."""
+    """Record of one call of an iterative solver. Arrays have one entry per ball if balls stop separately."""
 
     iterations: Int[Array, "..."]  # how often it went on
     reason: Int[Array, "..."]  # a `Reason`
@@ -66,7 +66,7 @@ class StopRule(Protocol):
     def measure(
         self, terms: Float[Array, "balls"], accumulate: Any, decision: Any, zero: Int[Array, ""]
     ) -> Float[Array, "..."]:
-        """Compute the residual: sum in the dtype `accumulate`, then round to `decision`."""
+        """Compute the residual: a sum in the dtype `accumulate`, rounded to the dtype `decision`."""
         ...
 
     def threshold(self, first: Float[Array, "..."], iteration: Int[Array, "..."]) -> Float[Array, "..."]:
@@ -173,7 +173,7 @@ def iterate(
     imposed: Int[Array, "..."] | None = None,
     history: bool = False,
 ) -> tuple[Any, Solve]:
-    """Iterate until the rule stops the solver, or up to a maximum or imposed number of iterations.
+    """Iterate until the rule stops the solver, or until the maximum or imposed iteration number.
 
     Args:
         rule: stopping rule.

@@ -162,7 +162,7 @@ class NumberLine:
         return self.known[place].digest
 
     def changes(self, a: int, b: int) -> Iterator[tuple[int, int, dict[int, DecisionHistory]]]:
-        """Yield adjacent ordinals with different decisions, in ascending order, and the search's runs.
+        """Yield adjacent ordinals with different decisions, ascending. Also yield the runs of the search.
 
         A grid interval is not searched if both ends have the same history of decisions.
         """
@@ -299,7 +299,7 @@ def _run(task: tuple[NumberLine | bytes, int]) -> DecisionHistory:
 def _searched(
     task: tuple[NumberLine | bytes, dict[int, DecisionHistory], int],
 ) -> list[tuple[Boundary | None, dict[int, DecisionHistory]]]:
-    """Find the lowest boundaries in a grid interval. Return each with the runs of its search."""
+    """Find the lowest boundaries in a grid interval. Return each boundary with the runs of its search."""
     own, ends, most = task
     line = _line_of(own)
     line.known |= ends

@@ -2,9 +2,9 @@
 
 Up to the *certified horizon*, every decision margin of a run exceeded its rounding bound. Exact arithmetic
 would give the same decisions for the same states. Up to the end of *protection*, |distance - cutoff| of every
-pair exceeded the possible difference of the distance between the runs. Up to both steps, the decisions of the
-two runs agree. Up to the *shadow horizon*, decisions agree if one program is at least as precise as the other
-in every role.
+pair exceeded the possible difference between its distances in the two runs. Up to the earlier of both steps,
+the decisions of the runs agree. Up to the *shadow horizon*, decisions agree if one program is at least as
+precise as the other in every role.
 
 Decisions are certified only for the actual states of the run. A run with correct decisions may have left the
 exact trajectory earlier (`forks.exact.certify` finds the step).

@@ -2,8 +2,8 @@
 
 Programs of one system may be compiled, batched or differentiated. All programs compute the same formulas but
 may round differently. Each variant of a program runs in its own process, because XLA flags apply to a whole
-process. Variants with equal positions at every step are numerically the same program. If hashes differ, the
-groups of variants with equal hashes indicate the cause.
+process. Variants with equal positions at every step are numerically the same program. If hashes of positions
+differ, the groups of variants with equal hashes indicate the cause.
 
 `python -m mdnum.forks.processes FILE` executes the task in a JSON file and writes an array of positions.
 """

@@ -215,7 +215,7 @@ def disagreements(fork: Fork, i: int, j: int) -> list[tuple[int, int | None]]:
 
 @dataclass(frozen=True)
 class Minimal:
-    """A minimal set of pairs. Decisions of run A on these pairs keep run B close to run A."""
+    """A minimal set of pairs. If run A's decisions on the set are imposed on run B, the runs stay close."""
 
     # pairs (i, j) whose pinning to A's decisions, from the start to the horizon, keeps B with A; None where
     # no set does
@@ -299,7 +299,7 @@ class _Search:
                 self._positions[segment.first + row] = HostCell(segment.cell_of(row)), x
 
     def holds(self, keys: Sequence[int]) -> bool:
-        """Repeat B with A's decisions on pairs. True if B stays near A, False if no run is left."""
+        """Repeat B with A's decisions on pairs. False if B splits from A, or no run is left."""
         name = frozenset(keys)
         if name not in self.known:
             if self.spent():

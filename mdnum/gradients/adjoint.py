@@ -151,7 +151,7 @@ def _of_pairs(force, x, tables, bits, onto_force, onto_energy, onto_virial, want
         return [leaf * w for leaf, w in zip(jax.tree.leaves(by), others, strict=True)]
 
     def terms(d, dw, inside, types) -> tuple[list[Array], Any]:
-        """Return each neighbor slot's contributions to the cotangents. Their order: positions, forces, box
+        """Return each neighbor slot's contributions to the cotangents. The order is positions, forces, box
         scale, pair-type parameters. Also return each block's contributions for shared parameters.
         """
         weights, several = factors(model, dw[3:]), len(dw[3:]) // 2

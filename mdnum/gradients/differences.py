@@ -394,7 +394,7 @@ class Ensemble(Method):
         return replace(made, description=f"the mean over replicas of {self.method.description}")
 
     def _horizons(self, problem: Problem) -> list[int]:
-        """Return numbers of steps (horizons) for which the loss uses a frame, shortest first."""
+        """Return the horizons (numbers of steps) at which the loss uses a frame, shortest first."""
         found = []
         for k in reversed(range(self.halvings + 1)):
             steps = problem.steps >> k

@@ -1,7 +1,7 @@
-"""Forward-mode derivatives: tangents of a few parameters along the recorded run.
+"""Forward-mode derivatives: tangents with respect to a few parameters, along a recorded run.
 
 A tangent is propagated through each step at the recorded state and decisions. Each parameter entry needs one
-more force evaluation per step, and no more memory.
+more force evaluation per step, but no memory for earlier steps.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ from mdnum.rollout.epoch import over_rows
 
 
 class TangentCarry(NamedTuple):
-    """Tangents of the state between two steps, one per parameter entry, in the user's order."""
+    """Tangents of the state between two steps, one per parameter entry. Atoms are in the user's order."""
 
     # of the positions as if the box had no faces, at the step that comes next
     x: Float[Array, "columns 3 atoms"]
@@ -227,7 +227,7 @@ def _stretch(
 
 
 def _whole(matrix: Float[Array, "3 3"]) -> Float[Array, "3 3"]:
-    """Return the lattice vectors, with unit vectors in place of zeros."""
+    """Return the lattice vectors, with unit vectors in place of zero vectors."""
     missing = jnp.all(matrix == 0, axis=1)
     return jnp.where(missing[:, None], jnp.eye(3, dtype=matrix.dtype), matrix)
 

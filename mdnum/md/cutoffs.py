@@ -59,7 +59,7 @@ class Cutoff(ABC):
         """
 
     def energy_jump(self, at: AtCutoff):
-        """Return the energy jump of a pair that enters: the limit of its energy at r_cut."""
+        """Return the energy jump when a pair enters the cutoff: its energy just inside r_cut."""
         return self._limits(at)[0] if self.smoothness < 0 else 0 * at.energy
 
     def force_jump(self, at: AtCutoff):

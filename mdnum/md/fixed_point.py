@@ -80,8 +80,8 @@ class FixedPointUnits:
         """Choose the units for a box, a neighbor list radius and a potential.
 
         The position spacing is the smallest power of two with exact squared distances of listed pairs. The
-        unit of force is the smallest with exact sums of momenta and forces in every valid run. The unit of
-        momentum is the unit of force times half a time step.
+        unit of force is the smallest for which all sums of momenta and forces are exact. The unit of momentum
+        is the unit of force times half a time step.
 
         Args:
             r_list: radius of the neighbor lists, length.
@@ -134,11 +134,11 @@ class FixedPointUnits:
         return np.round(np.asarray(x, np.float64) / self.spacing) * self.spacing
 
     def total(self, terms: Float[Any, "*shape"]) -> Float[Any, ""]:
-        """Return the sum of energies, each rounded to the unit of energy. The order has no effect."""
+        """Return the sum of energies, each rounded to the unit of energy. Their order has no effect."""
         return jnp.sum(jnp.round(terms * (1 / self.energy))) * self.energy
 
     def to_dict(self, timestep: float) -> dict[str, float]:
-        """Return the fixed-point units in the units of the system, by name."""
+        """Return the fixed-point units by name, as multiples of the system's units."""
         return {
             "spacing": self.spacing,
             "force": self.force,
@@ -263,7 +263,7 @@ class FixedPointStep(Integrator):
         """Return positions, velocities and extra state before the drift of a step."""
 
     def kinetic(self, v, masses):
-        """Return the kinetic energy. The order of the atoms has no effect."""
+        """Return the kinetic energy, which does not depend on the order of the atoms."""
         return self.units.total(0.5 * (masses * squared_norm(v[0], v[1], v[2], self.zero)))
 
     def glide(self, x, p, masses, share: float, direction: int):
@@ -377,7 +377,7 @@ def fixed_point_steps(integrator: Integrator, units: FixedPointUnits) -> FixedPo
 
 
 def _period(kept: int) -> int:
-    """Return after how many steps a factor of 2^24 / `kept` per step may overflow an integer."""
+    """Return the number of steps after which a factor of 2^24 / `kept` per step may overflow integers."""
     if not 0 < kept < 2**_SHIFT:
         return 0
     growth = 2**_SHIFT / kept

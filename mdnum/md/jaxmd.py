@@ -302,7 +302,7 @@ class PairSearch:
         return functions.allocate(jnp.asarray(folded))
 
     def __call__(self, positions: Float[np.ndarray, "atoms 3"]) -> Int[np.ndarray, "atoms slots"]:
-        """Return sorted neighbors within r_list, one row per atom. The number of atoms is the padding.
+        """Return sorted neighbors within r_list, one row per atom. Padding entries equal the number of atoms.
 
         Raises:
             NumericalError: a position is not finite.

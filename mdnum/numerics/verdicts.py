@@ -1,4 +1,4 @@
-"""When two runs diverge, how fast, and whether flips are the cause.
+"""Verdicts on two runs: when they diverge, how fast, and whether flips are the cause.
 
 A flip is a cutoff decision that differs between two runs. The verdict compares the second run with a
 counterfactual run. The counterfactual run has the arithmetic of run B, but the cutoff decisions of run A. If
@@ -33,7 +33,7 @@ _ALIKE = 4
 
 @dataclass(frozen=True)
 class Delay:
-    """The steps at which two runs split, without and with run A's decisions in run B."""
+    """The steps at which two runs split, without and with run A's decisions imposed on run B."""
 
     # free, imposed: steps of the two splits; None for one that was not seen
     free: int | None
@@ -64,8 +64,8 @@ def looks(pairs: int, error: float = ERROR) -> tuple[tuple[int, int], ...]:
     """Return the number of pairs of runs at each stage of the sign test, and how many must agree.
 
     The allowed error probability is used up in proportion to the number of pairs (Lan and DeMets, Biometrika
-    70, 659, 1983). Fair coin tosses give a result up to a stage with a limited probability. The limit is the
-    error probability times the fraction of pairs used so far.
+    70, 659, 1983). Up to each stage, the probability that fair coin tosses give a result is limited. The
+    limit is the error probability times the fraction of pairs used so far.
 
     Args:
         pairs: largest number of pairs of runs.
@@ -515,7 +515,7 @@ class Share:
 
 
 def table(series: Mapping[str, Shaped[np.ndarray, "steps"]], tolerance: float) -> tuple[SplitCell, ...]:
-    """Return when runs with the arithmetic and decisions of A or B split from A and from B.
+    """Return when each run with arithmetic and decisions of A or B splits from A, and from B.
 
     Args:
         series: separations at each step, length, by the names "B" and those in SERIES; NaN after a run ended.

@@ -51,8 +51,8 @@ def rounding_bound(
 ) -> float:
     """Upper bound on the rounding error (a length) of a distance close to r_cut.
 
-    The bound applies to codes that wrap coordinates, add a lattice vector, subtract and take the norm.
-    Numbers are at most as large as coordinates plus cell. Each operation of the code rounds once or twice.
+    The bound applies to codes that wrap coordinates, add a lattice vector, and compute the distance. No
+    intermediate number exceeds the sum of coordinates and cell vectors. Each operation rounds once or twice.
     Typical rounding errors are a tenth of this bound.
 
     Args:

@@ -88,7 +88,7 @@ def canvas(draw_into: Callable[[Canvas], None], height: float) -> Canvas:
 
 
 def line(axes: Axes, x: np.ndarray, y: np.ndarray, color: str, label: str = "", **look: object) -> None:
-    """Draw a line. For too many points, draw averages and a band from smallest to largest values."""
+    """Draw a line. Many points become averages, with a band from smallest to largest values."""
     low, middle, high, at = envelope(np.asarray(x), np.asarray(y))
     if len(y) > POINTS:
         axes.fill_between(at, low, high, color=color, alpha=0.3, lw=0)
@@ -112,7 +112,7 @@ def envelope(
 
 
 def legend(axes: Axes) -> None:
-    """Draw a legend above the axes. A legend there covers no data."""
+    """Draw a legend above the axes, where the legend covers no data."""
     handles, labels = axes.get_legend_handles_labels()
     if handles:
         longest = max(len(label) for label in labels)

@@ -55,7 +55,7 @@ def plain(value: float | None, digits: int = 4) -> str:
 
 
 def pair_name(pair: Mapping[str, Any]) -> str:
-    """Return the atom labels of a pair, and its potential term if terms have own cutoffs."""
+    """Return the atom labels of a pair, and its potential term if terms have their own cutoffs."""
     return f"{pair['i']}–{pair['j']}" + (f" ({pair['terms']})" if pair.get("terms") else "")
 
 

@@ -1,4 +1,4 @@
-"""Counterfactual runs: their own arithmetic, but the cutoff decisions of another run."""
+"""Counterfactual runs, with their own arithmetic but the cutoff decisions of another run."""
 
 from __future__ import annotations
 

@@ -103,7 +103,7 @@ class EpochProgram(eqx.Module):
 
 
 class EpochState(NamedTuple):
-    """State of a run between two force evaluations, in the user's order."""
+    """State of a run between two force evaluations, in the user's order of atoms."""
 
     step: Int[Array, ""]  # the step whose forces come next
     x: Float[Array, "3 atoms"]  # wrapped positions at that step, shape (3, atoms)
@@ -149,7 +149,7 @@ class EpochRecord(NamedTuple):
     inputs: Any = ()  # `StepInputs` of each row, where they were asked for
 
     def boxes(self, rows: int, pbc: tuple[bool, bool, bool]) -> tuple[Cell, ...]:
-        """Return the boxes of the first steps. Empty if the box is constant."""
+        """Return the boxes of the first `rows` steps. Empty if the box is constant."""
         if not self.cell.size:
             return ()
         return tuple(Cell.create(one, pbc) for one in np.asarray(self.cell)[:rows])

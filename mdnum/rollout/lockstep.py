@@ -93,7 +93,7 @@ def beside(
 
 
 def separation_of(a: Rows | None, b: Rows | None) -> Float[np.ndarray, "rows"]:
-    """Return each step's largest distance between an atom's positions in two runs. NaN after run b has ended.
+    """Return, by step, the largest distance between an atom's positions in two runs. NaN after run b ended.
 
     Positions are scaled to the box of the first run. Distances are minimum-image distances in this box.
     """

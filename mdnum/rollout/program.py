@@ -35,7 +35,7 @@ def squared_displacement(simulation: Simulation, x: np.ndarray, v: np.ndarray) -
 
 @dataclass(frozen=True)
 class MdProgram:
-    """A simulation with an initial state. The atoms and axes are mapped to another simulation."""
+    """A simulation with an initial state. `frame` maps atoms and axes to another simulation."""
 
     simulation: Simulation  # the system as objects
     begin: Start | None = None  # its start; None for the system's own

@@ -26,7 +26,7 @@ _META, _STORE = "mdnum meta", "mdnum store"
 def write(
     path: Path, state: Mapping[str, Any], store: Mapping[str, Any], beside: Mapping[str, list[str]]
 ) -> None:
-    """Write a checkpoint file. List all files written since the previous one in the manifest.
+    """Write a checkpoint file. The manifest lists all files written since the previous checkpoint.
 
     Args:
         state: state of the run: arrays, and values that JSON can represent.

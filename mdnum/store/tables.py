@@ -367,7 +367,7 @@ class _Writing:
 
 
 def together(parts: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
-    """Concatenate tables with the same columns. A column of equal texts may be one text."""
+    """Concatenate tables with the same columns. A column with equal texts may be given as one text."""
     columns = {name: [part[name] for part in parts] for name in parts[0]}
     return {name: one[0] if isinstance(one[0], str) else np.concatenate(one) for name, one in columns.items()}
 

@@ -51,7 +51,7 @@ class EndComparison:
 
 @dataclass(frozen=True)
 class Advice:
-    """Recommended value of one axis (a varied choice), with its comparisons.
+    """Recommended value of an axis (a varied choice), and comparisons with converged results.
 
     Attributes:
         key: key of the axis. end: the value that is regarded as converged; None if there is none.

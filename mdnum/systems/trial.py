@@ -151,7 +151,7 @@ class Trial:
         return (self.model.parameters, *map(jnp.asarray, given))
 
     def _compile(self) -> None:
-        """Find a list format and keywords for the function. Compile energy and derivatives."""
+        """Find a list format and keywords for the energy function. Compile energy and derivatives."""
         formats = FORMATS if self.model.format == "any" else (self.model.format,)
         words, failed = self.call.how.keywords, ""
         # a space of jax-md may raise at a keyword that the function passes on

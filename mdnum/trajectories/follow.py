@@ -386,7 +386,7 @@ def differing_rows(
 def _thresholds(
     i: np.ndarray, j: np.ndarray, inside: np.ndarray, rule: Rule, side: ComparedSide
 ) -> Float[np.ndarray, "pairs"]:
-    """Return each pair's threshold distance. For nearest-neighbor rules, it depends on i."""
+    """Return each pair's threshold distance. For nearest-neighbor rules, the threshold depends on i."""
     if isinstance(rule, CutoffRule):
         return np.full(len(i), rule.radius)
     if isinstance(rule, SpeciesCutoffs):
@@ -485,7 +485,7 @@ def follow_both(sets: list[NeighborSets], atoms: AtomIndices, sink: Sink) -> Ite
 def _apart(
     found: Compared, a: Frame, b: Frame, atoms: AtomIndices, sides: Sequence[ComparedSide]
 ) -> tuple[Separation, float]:
-    """Return each atom's distance between two files without a common shift, and an error bound.
+    """Return the displacements between two files without a common shift, and their error bound.
 
     A common shift is removed only if the shift explains nearly all of the distances. Different origins, or
     removed center-of-mass motion in one file, cause a common shift.

@@ -129,7 +129,7 @@ def _reader_of(file: Path, format: str | None) -> Callable[..., Trajectory]:
 
 
 def _first_lines(file: Path) -> tuple[str, str]:
-    """Return the first two lines of a text file in lower case. The lines are empty for other files."""
+    """Return the first two lines of a text file in lower case. For a binary file, both lines are empty."""
     from ase.io.formats import open_with_compression
 
     try:

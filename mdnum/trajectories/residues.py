@@ -182,7 +182,7 @@ class ResidueTracker:
         return Members(i, j, np.zeros_like(i), self._closest(self._last, i, j)[0])
 
     def _closest(self, frame: Frame, i: np.ndarray, j: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return, by residue pair, distance and threshold of the atom pair with the largest margin."""
+        """Return, for each residue pair, distance and threshold of its atom pair with largest margin."""
         placed, found = self._placed(frame), np.full((2, len(i)), np.inf)
         for begin in range(0, len(i), _TOGETHER):
             part = slice(begin, begin + _TOGETHER)

@@ -70,12 +70,12 @@ class Resolution:
         """Return the largest rounding error of a distance in a frame.
 
         The bound is a length. In the worst case, both atoms move in opposite directions by half a grid
-        spacing along every axis. For pairs across the boundary, the rounding error of the box is added. For
-        float64 positions, the bound is the rounding error of the distance. The difference between a distance
-        and the cutoff has the same bound. The difference between two neighbors' distances has twice the
-        bound. If `atoms` are given, the bound holds for distances between these atoms.
+        spacing along every axis. For pairs across a periodic boundary, the rounding error of the box is
+        added. For float64 positions, the bound is the rounding error of the distance. The difference between
+        a distance and the cutoff has the same bound. The difference between two neighbors' distances has
+        twice the bound. If `atoms` are given, the bound holds for distances between these atoms.
 
-        Error: the bound holds within one period of the box. Each further period adds the error of the box.
+        The bound holds within one period of the box. Each further period adds the rounding error of the box.
         """
         if atoms is not None or not np.isfinite(frame.furthest):
             x = frame.positions if atoms is None else frame.positions[atoms]

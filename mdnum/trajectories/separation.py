@@ -158,7 +158,7 @@ def flight_of(start: Frame, end: Frame, step: float = 0.0) -> FreeFlight | None:
 
 
 def odd_flight(flights: Sequence[FreeFlight]) -> dict[str, Any] | None:
-    """Describe a contradiction between displacements, velocities and times (medians over frames), if any.
+    """Describe any contradiction between displacements, velocities and times (medians over frames).
 
     If atoms turn around between two frames, small displacements are expected. Small displacements contradict
     the velocities only if velocities keep their directions, parallel to the displacements.

@@ -37,7 +37,7 @@ _UNIT = 2.0**-24
 
 
 class Tiled(NamedTuple):
-    """Tiles of pairs with the same cutoff radius, with all decisions at the last frame."""
+    """Tiles of pairs with the same cutoff radius, and all their decisions at the last frame."""
 
     first: Int[np.ndarray, "tiles"]  # clusters
     second: Int[np.ndarray, "tiles"]
@@ -251,7 +251,7 @@ def _tiled(
     shifts: Float32[np.ndarray, "27 3"],
     reach: np.float32,
 ) -> Tiled:
-    """Return the tiles of two kinds of atoms with cluster boxes closer than `reach`."""
+    """Return the tiles of two kinds of atoms. The boxes of both clusters are closer than `reach`."""
     room = 32 * int(runs[a + 1] - runs[a]) + 64
     while True:
         made = np.empty((3, room), np.int32)

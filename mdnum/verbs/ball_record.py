@@ -1,4 +1,4 @@
-"""Content of a ball's folder: tables, summary, and differences from closed forms."""
+"""Content of the output folder of a ball's run: tables, summary, and differences from closed forms."""
 
 from __future__ import annotations
 
@@ -64,7 +64,7 @@ def ranges(run: BallRun) -> dict[str, np.ndarray]:
 
 
 def contacts(run: BallRun) -> dict[str, np.ndarray]:
-    """Return a table of contact flips (begin or end of a contact)."""
+    """Return a table of contact flips (beginnings and ends of contacts)."""
     flips = run.contacts
     lift = 0.0 if run.world.lift is None else float(run.world.lift)
     return {
@@ -77,8 +77,8 @@ def contacts(run: BallRun) -> dict[str, np.ndarray]:
 def decisions(run: BallRun) -> dict[str, np.ndarray]:
     """Return a table of the solver's stop decisions.
 
-    All decisions are included for one solver with residual histories. In other cases, only the last two
-    decisions of each solver call are included.
+    If one solver with residual histories serves all balls, all decisions are included. In other cases, only
+    the last two decisions of each solver call are included.
     """
     rule = rule_of(run)
     if rule is None:
@@ -182,7 +182,7 @@ def compared(
     gradient: Sequence[Mapping[str, Any]],
     theirs: Sequence[Mapping[str, Any]],
 ) -> dict[str, Any]:
-    """Return where a variant and the run diverge, and the variant's gradient.
+    """Return the differences between a variant and the run, and the variant's gradient.
 
     Args:
         found: the difference between the two runs.

@@ -192,7 +192,7 @@ def conform(
             return summary_of(found, _write_scripts(folder, found), options.seed)
 
         def saved(urgent: bool) -> None:
-            """Save the latest result. Write scripts and summary at intervals."""
+            """Save the latest result. At intervals, also write scripts and summary."""
             nonlocal due
             kept.save(urgent)
             if (now := monotonic()) >= due:

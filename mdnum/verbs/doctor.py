@@ -8,7 +8,7 @@ from mdnum.verbs import Reply
 
 
 def diagnose() -> Reply:
-    """Test this machine. Return each result, with a remedy if the test failed."""
+    """Test this machine. Return each test result, with a remedy if the test failed."""
     found = doctor.diagnose()
     rows = [(row.status, row.name, row.seen) for row in found.rows]
     remedies = [f"{row.name}: {row.remedy}" for row in found.rows if row.remedy]

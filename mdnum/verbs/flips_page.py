@@ -111,7 +111,7 @@ def _ended(view: FlipsView) -> Iterator[Finding]:
 
 
 def _disagreeing(view: FlipsView, place: int) -> np.ndarray:
-    """Return frames where the pair count does not equal the previous count plus flips."""
+    """Return frames in which the number of pairs contradicts the previous number and the flips."""
     table = view.table("frames")
     rows = table["rule"] == place
     net = (table["entered"][rows] - table["left"][rows])[1:]

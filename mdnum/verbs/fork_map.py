@@ -1,4 +1,4 @@
-"""`mdnum fork map` and `mdnum fork forecast`: how decisions change with a parameter or the start."""
+"""`mdnum fork map` and `mdnum fork forecast`: decisions versus a parameter or the initial positions."""
 
 from __future__ import annotations
 
@@ -183,7 +183,7 @@ def _row(edge: Boundary) -> dict[str, Any]:
 
 
 def judge_map(view: View) -> Verdict:
-    """Return the verdict on a map: where decisions change, and jumps of the loss."""
+    """Return the verdict on a map: at which parameter values decisions change and the loss jumps."""
     s = view.summary
     edges, left, failed = s["boundaries"], s["unresolved"], s["failed_runs"]
     all_failed = bool(failed) and failed == s["evaluations"]

@@ -146,7 +146,7 @@ def _problem(
 def plan(
     problem: Problem, names: Sequence[str], asked: Sequence[str] | None, replicas: int = 0
 ) -> tuple[list[Method], list[dict[str, str]]]:
-    """Return the gradient methods to run, and the omitted methods with reason and option.
+    """Return the gradient methods to run. Return each omitted method with a reason and an option to run it.
 
     Args:
         asked: names of methods; None for the fast ones.
@@ -187,7 +187,7 @@ def _too_long(method: Method, problem: Problem, names: int) -> str:
 
 
 def _over(method: Any, replicas: int, horizons: bool = True) -> Method:
-    """Set the number of initial states of a gradient method that uses several."""
+    """Set the number of initial states of a gradient method that averages over initial states."""
     if not replicas or not hasattr(method, "replicas"):
         return method
     changed = replace(method, replicas=replace(method.replicas, count=replicas))
@@ -290,7 +290,7 @@ def _not_run(
     asked: int | None, problem: Problem, found: GradientDiagnosis, replicas: int,
     further: Sequence[str], half_step: bool,
 ) -> list[dict[str, str]]:  # fmt: skip
-    """Return the results that were not computed, each with its reason and option."""
+    """Return the results that were not computed, each with a reason and an option to compute it."""
     from mdnum.gradients.diagnose.trust import no_half_step
 
     own, rows = problem.simulation.steps, []

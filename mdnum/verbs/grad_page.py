@@ -111,7 +111,7 @@ def closeness(row: Mapping[str, Any]) -> str:
 
 
 def limit_sentence(summary: Mapping[str, Any], limit: Mapping[str, Any]) -> str:
-    """Return a sentence on one limit to the steps over which a gradient can be trusted."""
+    """Return a sentence on a limit of the number of steps with a trusted gradient."""
     code = f"{limit['what']}_{limit['code']}".replace(" ", "_")
     values = {"horizon": limit["horizon"], **limit["values"]}
     first = values.get("first")

@@ -168,7 +168,7 @@ def _told(system: str, over: Sequence[str], given: dict[str, Any]) -> Any:
 def _compute(
     place: Workspace, plan: Plan, log: Any, on: Any, workers: int | None, keep: bool
 ) -> dict[str, Any]:
-    """Compute missing points, and wait for points of other sweeps. Return point counts."""
+    """Compute missing points. Wait for points that other sweeps compute. Return point counts."""
     wanted = {one.address: one for one in plan.points if not one.wrong}
     missing = [a for a in wanted if not enough(place.result(a), plan.wanted)]
     missed = place.nearest(wanted[missing[0]].state) if missing else None

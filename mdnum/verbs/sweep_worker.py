@@ -136,7 +136,7 @@ def _run(task: Task, point: Mapping[str, Any], folder: Path) -> Sample:
 
 
 def _bounced(system: Any, steps: int, task: Task, point: Mapping[str, Any], folder: Path) -> Sample:
-    """Simulate a ball, and return the data for measures."""
+    """Simulate a ball, and return the data from which measures are computed."""
     import pyarrow
     import pyarrow.parquet as parquet
 

@@ -185,7 +185,7 @@ class ForcesCheck(AuditCheck):
 
 
 def _fewer(subject: CalculatorSubject, atoms: Atoms, rng: np.random.Generator) -> tuple[Atoms, NoiseFloor]:
-    """Return a nonperiodic cluster around the first atom, and its noise level."""
+    """Return a nonperiodic cluster around the first atom, and its noise of energy and forces."""
     away = atoms.get_distances(0, range(len(atoms)), mic=bool(atoms.pbc.any()), vector=True)
     nearest = np.sort(np.argsort(np.linalg.norm(away, axis=1))[:_CLUSTER])
     there = Atoms(atoms.numbers[nearest], away[nearest])

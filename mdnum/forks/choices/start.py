@@ -94,8 +94,8 @@ class Relabel(Summed):
 class Rotate(Summed):
     """The axes of the box exchanged or reversed.
 
-    An exchange of axes is exact. The exchange changes the order of the sum of a squared distance. A change of
-    sign rounds positions once more, when positions are wrapped into the box.
+    An exchange of axes is exact. The exchange changes the order of the sum of a squared distance. If an axis
+    is reversed, wrapping positions into the box needs one more rounding.
     """
 
     screened = "rotate rotate@exact"
@@ -175,7 +175,7 @@ class Translate(Summed):
 class Images(Choice):
     """Atoms that start in other periodic images.
 
-    Positions are wrapped before the first step. An exact image gives the same position bit for bit. Usually,
+    Positions are wrapped before the first step. Wrapping an exact image gives the same bits. Usually,
     however, the sum of a position and a lattice vector is rounded. Both runs therefore start from positions
     with exact images. The positions differ from those in the file by at most one ulp of the lattice vector.
     """

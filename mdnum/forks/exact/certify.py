@@ -103,7 +103,7 @@ def certify(
     policies: Mapping[str, Roles] | None = None,
     progress: Progress | None = None,
 ) -> Certificate:
-    """Compute the exact history, and the step at which each precision leaves it.
+    """Compute the exact history, and the step at which a run in each precision leaves this history.
 
     The numbers of the system file are rounded to float64. A run in lower precision rounds the numbers of the
     file again. The deviation of the run includes this rounding.
@@ -163,7 +163,7 @@ def _certify_md(system: Simulation, last: int, policies: Mapping[str, Roles], no
     matrix = np.where(np.array(simulation.pbc)[:, None], np.asarray(simulation.cell.matrix), 0.0)
 
     def reduced(x: Float[np.ndarray, "... 3"]) -> Float[np.ndarray, "... 3"]:
-        """Wrap positions into the box. Nearest images are then at most one lattice vector away."""
+        """Wrap positions into the box. Their nearest images are at most one lattice vector away."""
         return x - np.floor(x @ np.asarray(simulation.cell.inverse)) @ matrix
 
     rows = []
@@ -227,7 +227,7 @@ def _certify_ball(system: BallSystem, last: int, policies: Mapping[str, Roles], 
 
 
 def _steps_per_bit(rows: list[PolicyHorizon]) -> float:
-    """Return the number of steps in which the deviation doubles, from the longest fit."""
+    """Return the number of steps in which the deviation doubles, according to the longest fit."""
     # separations that grow by a power of time, as those of a lone pair, are no exponentials
     fits = [row.growth for row in rows if row.growth is not None]
     fits = [fit for fit in fits if fit.rate > 0 and fit.r_squared > _EXPONENTIAL]

@@ -99,8 +99,8 @@ class Turns:
     @property
     def term(self) -> Float[np.ndarray, "turns columns"]:
         """Largest possible contribution of the two crossings at each turning point. If a distance equals the
-        cutoff within its uncertainty, a passage by 1 % of the uncertainty is assumed. For other pairs, the
-        result is the change of the contribution with shorter time steps.
+        cutoff within its uncertainty, the pair is assumed to pass the cutoff by 1 % of the uncertainty. For
+        other pairs, the result is the change of the contribution when the time step is shortened.
         """
         bend, reach = self.table["bend"], self.reach
 
@@ -247,7 +247,7 @@ def _joined(rows: list[dict[str, np.ndarray]], **more: np.ndarray) -> dict[str, 
 def hermite(
     r0: np.ndarray, s0: np.ndarray, r1: np.ndarray, s1: np.ndarray, time: float
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Find the extremum of a cubic between two distances.
+    """Find the extremum of the cubic polynomial that interpolates a pair distance over time.
 
     Args:
         r0, s0, r1, s1: distance and its rate at the two ends. time: between the ends.

@@ -95,7 +95,7 @@ def conditioning(cell: ndarray, pbc: ndarray) -> float:
 def keys(count: int, i: ndarray, j: ndarray, shift: ndarray | None, *others: tuple) -> list[ndarray]:
     """Return an integer key for each row (i, j, shift). Equal rows have equal keys.
 
-    Rows of `others` have keys, too. `count` is the number of atoms.
+    Keys of the rows of `others` are returned, too. `count` is the number of atoms.
     """
     sets = [(i, j, shift), *others]
     lengths = np.cumsum([0, *(len(rows[0]) for rows in sets)])

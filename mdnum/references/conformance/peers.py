@@ -1,8 +1,8 @@
 """Neighbor searches of libraries, found by name or `module:function`.
 
-Every function and class in this module is self-contained, including all imports. The source of each is copied
-into scripts that reproduce a failure without mdnum. Each function calls its library as a user would. Unusual
-input is passed on unchanged.
+Every function and class in this module is self-contained, including all imports. The source of each function
+and class is copied into scripts that reproduce a failure without mdnum. Each function calls its library as a
+user would. Unusual input is passed on unchanged.
 """
 
 # pyright: reportOptionalMemberAccess=false, reportOptionalCall=false

@@ -105,8 +105,8 @@ class Examiner:
     def _find_padding(self) -> None:
         """Determine whether and how far an updatable list returns pairs beyond the cutoff.
 
-        The padding is the declared padding. Otherwise the padding is the distance of the nearest missing pair
-        minus the cutoff.
+        A declared padding is used. Without it, the padding is the distance of the nearest missing pair minus
+        the cutoff.
         """
         report = self.report
         crowd = replace(once("a crowd", "few", gas(*_CROWD), _CROWD[1]), skin=_SKIN)
