@@ -39,7 +39,7 @@ def environment(**changes: str) -> dict[str, str]:
 
 
 def guard(parent: int) -> None:
-    """End this process when its parent process ends. Limit its memory to half of the machine's memory.
+    """End this process when its parent process ends. Limit the process to half of the machine's memory.
 
     On systems other than Linux, a process ends only after a running C function has returned.
 

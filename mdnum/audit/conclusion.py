@@ -67,8 +67,8 @@ def to_come(results: Sequence[CheckResult], wanted: Sequence[str]) -> bool:
 def concluded(results: Sequence[CheckResult]) -> dict[str, str]:
     """Return the text of each finding that depends on several checks.
 
-    Incorrect forces without work around closed loops are the gradient of another energy. Forces with work
-    around closed loops are not the gradient of any energy.
+    Incorrect forces that do no work around closed loops are the gradient of another energy. Forces that do
+    work around closed loops are not the gradient of any energy.
     """
     numbers = {result.name: result.numbers for result in results if not largely_unasked(result)}
     curl, forces = numbers.get("curl"), numbers.get("forces")

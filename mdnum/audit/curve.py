@@ -82,7 +82,7 @@ def grid(low: float, high: float, step: float) -> Float[np.ndarray, "points"]:
 def scatter(curve: Curve, low: float, high: float, room: float) -> Float[np.ndarray, "2 2"]:
     """Estimate the noise of energy and force (columns) below `low` and above `high` (rows).
 
-    Of several spacings, the largest estimate counts, as close float32 values can be equal.
+    The largest of several estimates is returned, because close float32 values can be equal.
     """
     sides = []
     for start, sign in ((low, -1.0), (high, 1.0)):
@@ -199,7 +199,7 @@ def find_jumps(
 
 
 def measure(curve: Curve, low: float, high: float, room: float, exact: bool, curved: bool = True) -> Jump:
-    """Measure the jumps between `low` and `high`, and the jumps of a smooth curve.
+    """Measure the jumps between `low` and `high`, and the changes that a smooth curve would have.
 
     Energies and forces on either side are medians of four values, so that one rounding error has no effect.
     The curvature is computed from one-sided differences of the force.

@@ -188,7 +188,7 @@ class CalculatorSubject:
         return other
 
     def used(self) -> CalculatorSubject:
-        """Return a copy that does not clear the cache."""
+        """Return a copy of the subject that does not clear the calculator's cache."""
         other = self.fresh()
         other.forgets = other.renews = False
         return other
@@ -222,7 +222,7 @@ class CalculatorSubject:
         return energy, other
 
     def forces(self, atoms: Atoms) -> Forces:
-        """Return the forces (eV/Å). Raise an error if the array shape is wrong."""
+        """Return the forces (eV/Å). Raise an error if the shape of the array is wrong."""
         asked = self._ask(atoms)
         forces = np.array(self._answer(asked.get_forces, asked, "forces"), dtype=np.float64)
         if forces.shape != (len(asked), 3):
@@ -312,7 +312,7 @@ class CalculatorSubject:
         return asked
 
     def _nearly(self, atoms: Atoms) -> bool:
-        """Return whether ASE treats a structure as unchanged although bits differ."""
+        """Return whether ASE ignores a small change of a structure."""
         check = getattr(self.calculator, "check_state", None)
         if not callable(check):
             return False

@@ -3,9 +3,9 @@
 In a many-body potential, the interaction of a pair depends on other atoms. The energy may jump at a threshold
 where two isolated atoms have a smooth energy. Therefore, atoms and triples of atoms are moved through all
 pair thresholds and other distances. To detect a limit on the number of neighbors, an atom is moved past the
-neighbors of a crowded atom. If only k neighbors are kept, the energy or a force jumps where the moving atom
-is as far away as the k-th neighbor. If only the first k neighbors of the list are kept, reordering the atoms
-reveals the limit.
+neighbors of a crowded atom. If only k neighbors are kept, the energy or a force jumps when the moving atom
+replaces the k-th neighbor. If only the first k neighbors of the list are kept, reordering the atoms reveals
+the limit.
 """
 
 from __future__ import annotations
@@ -101,7 +101,7 @@ class Route:
         return sorted(found, key=lambda one: one.at)
 
     def ties(self, along: float) -> tuple[tuple[int, int], ...]:
-        """Return (atom, k) for each atom whose k-th and (k+1)-th neighbors swap."""
+        """Return (atom, k) for each atom whose k-th and (k+1)-th neighbors exchange their ranks."""
         return exchanged(self.at(along - _TIED), self.at(along + _TIED))
 
 
@@ -132,7 +132,7 @@ class EnvironmentWalks:
 
     @property
     def lower(self) -> list[Event]:
-        """Crossings at which the energy is less smooth than for two isolated atoms."""
+        """Threshold crossings at which the energy of many atoms is less smooth than that of two."""
         return [one for one in self.events if one.threshold and one.jump.order < min(one.threshold.order, 2)]
 
 
@@ -190,7 +190,7 @@ def _groups(atoms: Atoms, single: bool) -> list[np.ndarray]:
 
 
 def _cut_out(atoms: Atoms, groups: Sequence[np.ndarray], pair: Pair) -> Atoms:
-    """Return a cluster of the groups nearest to the first group, in the pair's cell."""
+    """Return a cluster of the groups nearest to the first group, in the cell of a pair of atoms."""
     center = _lead(atoms, groups[0])
     offsets = atoms.get_distances(center, np.arange(len(atoms)), mic=bool(atoms.pbc.any()), vector=True)
     nearest = np.argsort([np.linalg.norm(offsets[_lead(atoms, group)]) for group in groups])
@@ -313,7 +313,7 @@ def _random(atoms: Atoms, groups: Sequence[np.ndarray], count: int) -> list[tupl
 
 
 def _rounded(event: Event, quantum: tuple[float, float]) -> bool:
-    """Return whether a jump is due to the few decimals of a calculator."""
+    """Return whether a jump is due to the few decimals of a calculator's results."""
     if not any(quantum):
         return False
     small = abs(event.jump.energy) <= STEPS * quantum[0] and event.force <= STEPS * quantum[1]
@@ -336,7 +336,7 @@ class CrowdOrder(NamedTuple):
 
 @dataclass(frozen=True)
 class Crowd:
-    """A central atom with many neighbors, and the jumps when it gains another."""
+    """A central atom with many neighbors, and the jumps when it gains another neighbor."""
 
     species: str  # of all atoms
     radius: float  # cutoff that the crowd is inside of, length
@@ -488,7 +488,7 @@ def _order(subject: CalculatorSubject, walk: PairWalk, radius: float, most: int)
 def _permuted(
     subject: CalculatorSubject, walk: PairWalk, radius: float, count: int, aside: bool = False
 ) -> tuple[float, float] | None:
-    """Return the changes of energy and force when atoms are reordered. None if rounding explains them.
+    """Return the changes of energy and force when atoms are reordered. None if rounding explains the changes.
 
     If `aside` is true, the last neighbor is moved until it interacts with no atom.
     """

@@ -284,7 +284,7 @@ def _of_others(pair: Pair, threshold: PairThreshold, thresholds: Sequence[PairTh
 def _end_of(
     coarse: Float[np.ndarray, "points"], alive: Callable[[float], bool]
 ) -> tuple[float, float] | None:
-    """Return the largest distance with an interaction, and the next double. None if there is none.
+    """Return the largest distance with an interaction, and the next larger double. None if there is none.
 
     A smooth switching function may round to zero before its end. The search continues if there is an
     interaction at a larger distance.
@@ -342,7 +342,7 @@ def _with_end(
 def _root(curve: Curve, edge: float, room: float, power: int) -> float:
     """Use a power law of the force to find where an interaction ends.
 
-    If the last distance with a nonzero force agrees within the error, that distance is returned. The last
+    If the last distance with a nonzero force agrees with the power law, that distance is returned. The last
     distance is more exact, unless rounding made the force zero.
     """
     places = edge - room * np.array([0.02, 0.01, 0.005])
@@ -445,7 +445,7 @@ def _smooth(curve: Curve, low: float, high: float, noise: Float[np.ndarray, "2"]
 
 
 def _left(nodes: Float[np.ndarray, "nodes"], forces: Float[np.ndarray, "nodes"]) -> float:
-    """Return the energy change to infinity for a power-law force. inf if it diverges."""
+    """Return the power-law energy change from the last distance to infinity. inf if the change diverges."""
     first, last = abs(float(forces[0])), abs(float(forces[-1]))
     if not last or not first:
         return np.inf

@@ -28,7 +28,7 @@ _CHUNK = 2**21  # balls times steps that leave the device at once
 
 @result
 class BallRun:
-    """Record of a finished run. In arrays with one row per step, row s is the step from state s to s + 1.
+    """Record of a finished run. Row s of per-step arrays belongs to the step from state s to s + 1.
 
     Attributes:
         world: the bouncing-ball model that was simulated.
@@ -227,7 +227,7 @@ def _flips(world: World, made: int, before, y, v, rows: dict[str, np.ndarray]) -
 def height_bound(
     world: World, y: Float[np.ndarray, "..."], v: Float[np.ndarray, "..."]
 ) -> Float[np.ndarray, "..."]:
-    """Return a bound on the rounding error of the height in a contact decision, m.
+    """Return a bound (m) on the rounding error of the height in a contact decision.
 
     The height is computed with four roundings from the previous state.
 
@@ -240,7 +240,7 @@ def height_bound(
 
 
 def residual_bound(world: World, residual: Any, terms: int) -> Any:
-    """Return a bound on the rounding error of a residual, in its unit.
+    """Return a bound on the rounding error of a residual, in the unit of the residual.
 
     The terms of a residual have one sign, so the relative error is at most Higham's gamma_n.
 

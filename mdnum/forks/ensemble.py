@@ -108,7 +108,7 @@ def hats(
     """Count pair distances with hat functions. Each distance contributes to two nodes.
 
     The contribution to a node grows linearly as the distance approaches the node. A distance below the first
-    node is counted at this node. No count jumps when a pair distance passes the last node.
+    node is counted at this node. Counts do not jump when a pair distance passes the last node.
     """
     width = nodes[1] - nodes[0]
     place = np.clip((distances - nodes[0]) / width, 0.0, len(nodes) - 1.0)
@@ -172,7 +172,7 @@ def ensemble(
 
 
 def steps_to_diverge(simulation: Simulation, start: Start | None, separation: float, seed: int) -> int | None:
-    """Return the step at which two runs have moved apart by a distance.
+    """Return the step at which two runs have moved apart by a given distance.
 
     The result is None if the runs stay together for 20,000 steps, or if a run blows up.
     """

@@ -92,7 +92,7 @@ def tangents(
     if not isinstance(force, PairForce):
         raise InputError(
             "pair decisions cannot be imposed on a many-body potential",
-            remedy="Use a system with a pair potential",
+            remedy="Linearize a system with a pair potential",
         )
     dtype, clock = simulation.policy.dtype("state"), _CLOCK * float(simulation.integrator.timestep)
     shift = 0.0
@@ -243,8 +243,8 @@ class Lyapunov:
     def steps_to(self, start: float, end: float) -> float | None:
         """Return the step at which a displacement has grown from one length to another.
 
-        During the run, a displacement grows like the tangent vector of the linearized run; later, it grows
-        exponentially. Return None if a displacement without chaos does not reach `end` during the run.
+        The displacement grows in proportion to the tangent during the run, and exponentially after the run.
+        The result is None if a displacement without chaos does not reach `end` during the run.
 
         Args:
             start: largest displacement of an atom at the start, length; for example one rounding unit.
@@ -382,7 +382,7 @@ class Forecast:
         return _each_pair_once(flips, count)
 
     def nearest(self, count: int = 10) -> tuple[PredictedFlip, ...]:
-        """Return the predicted flips of smallest positive or negative amplitude, one for each pair.
+        """Return the predicted flips with the smallest |amplitude|, one for each pair of atoms.
 
         A flip is included only if the forecast is valid up to its step. If the force jumps at the cutoff,
         only the first flip can be predicted.

@@ -173,7 +173,7 @@ def fork(
 def counterfactuals(
     twin: Twin, counterfactual: bool, back: bool | None, repeats: int | None
 ) -> tuple[bool, bool, int]:
-    """Return whether run B gets run A's decisions, whether A gets B's, and the number of repeats.
+    """Return whether A's decisions are imposed on B, whether B's on A, and the number of repeats.
 
     Raises:
         InputError: a requested counterfactual run or repeat is not possible.
@@ -220,8 +220,8 @@ def displacements(fork: Fork) -> tuple[float, float]:
     """Return two initial displacements for repeats of run B: an early distance from run A, and a smaller one.
 
     The second displacement is a hundredth of the first. A much smaller displacement would lead to the same
-    rounding errors as in the compared runs. The second may be larger if a hundredth of the first is below one
-    ulp.
+    rounding errors as in the compared runs. The second displacement may be larger if a hundredth of the first
+    is below one ulp.
     """
     begins = (fork.dates.fork if fork.dates.first_bit is None else fork.dates.first_bit) or 0
     soon = fork.series["B"][begins : min(max(begins, 1) + _SOON, fork.dates.fork or fork.steps + 1)]

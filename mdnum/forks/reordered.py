@@ -5,7 +5,7 @@ list contains each pair twice. Each entry contributes half of the pair force. In
 atom's own row form one sum, those in other rows a second sum. The two sums are added. A loop over atom labels
 gives the same result if rows are sorted. In a dense list, entries in other rows are added one by one to the
 sum over the atom's own row. An ordered-sparse list contains each pair of atoms once. Forces from atoms with
-larger labels form one sum, those from smaller labels another.
+larger labels form one sum, those from smaller labels a second sum.
 
 Source: jax_md.smap.pair_neighbor_list of jax-md 0.2.29, whose forces are reproduced bit for bit
 (tests/forks/test_choices.py). XLA adds more than 32 slots of an atom in blocks of 32. Such blocks are not

@@ -89,7 +89,7 @@ def varied(system: Any, values: Mapping[str, Any], name: str | None = None) -> A
 
 
 def twin(system: Any, values: Mapping[str, Any], name: str, difference: str) -> Twin:
-    """Make a pair of programs: one of a system, one of the same system with other values."""
+    """Make a pair of programs: of a system, and of the same system with changed values."""
     other = varied(system, values, name)
     a, b = map(program_of, alike(system, other))
     return Twin(a, b, difference, changes(system, other))

@@ -154,7 +154,7 @@ def _look(forces: tuple[PairForce, PairForce], tables, rows, bits, seen, looking
 
 
 def standard_error(series: Float[np.ndarray, "frames"]) -> float:
-    """Return the standard error of a correlated series, the largest for 8, 16 and 32 blocks.
+    """Return the standard error of a correlated series: the largest with 8, 16 or 32 blocks.
 
     Source: H. Flyvbjerg, H. G. Petersen, J. Chem. Phys. 91, 461 (1989).
     """

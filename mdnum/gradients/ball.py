@@ -1,4 +1,4 @@
-"""Gradient methods for a simulated bouncing ball; the methods treat contact decisions differently.
+"""Gradient methods for a simulated bouncing ball, with different treatments of contact decisions.
 
 Unrolled methods differentiate the executed operations. Frozen methods keep all decisions fixed. Randomized
 methods average the loss over random parameters. Methods that replace the contact by another model are in

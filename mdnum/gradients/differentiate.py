@@ -142,7 +142,7 @@ def _differentiated(chosen: Method, problem: Problem, names: tuple[str, ...]) ->
 
 
 def _in_full(problem: Problem, values: Values, full: Sequence[str]) -> dict[str, np.ndarray]:
-    """Return the values by full name. The given names may be short."""
+    """Return the parameter values by full parameter name. The given names may be short."""
     out = {}
     for word, value in values.items():
         (name,) = parameters.resolve(problem.simulation, [word])

@@ -99,7 +99,7 @@ class Problem:
 
 @dataclass(frozen=True)
 class Gradient:
-    """Gradient of a loss by one method, and what this method computes.
+    """Gradient of a loss by one method, and a description of this method.
 
     Attributes:
         method: name of the method. description: one sentence on the derivative that the method computes.
@@ -254,7 +254,7 @@ def rounded(simulation: Simulation) -> str | None:
 
 
 def scalars_only(problem: Problem, names: Sequence[str]) -> str | None:
-    """Return why finite differences do not apply (an array parameter), or None."""
+    """Return why finite differences do not apply, or None. Array parameters are unsupported."""
     large = [name for name in names if np.ndim(parameters.value(problem.simulation, name))]
     return f"{', '.join(large)}: a value for each shift of each entry would be needed" if large else None
 

@@ -1,4 +1,4 @@
-"""A run recorded for gradients: its time steps, in either order, and sums for the loss.
+"""A run recorded for gradients: its time steps, in forward or reverse order, and sums for the loss.
 
 Recorded stretches of steps are kept in memory up to the memory limit. Other stretches are computed again from
 the state at their first step. Repeated steps agree with the first run bit for bit. A run in fixed-point
@@ -219,7 +219,7 @@ class RunTape:
 
     @property
     def jumps_unseen(self) -> tuple[float, float]:
-        """Derivatives with respect to energy and virial of a frame. (0, 0) for equally spaced frames.
+        """Derivatives of the loss with respect to energy and virial. (0, 0) for equally spaced frames.
 
         For losses of a single frame, gradients omit jumps of energy and virial at flips.
         """

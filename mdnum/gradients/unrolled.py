@@ -56,7 +56,7 @@ class Inputs(NamedTuple):
 
 
 class StepEnds(NamedTuple):
-    """Differentiable state between two steps. Velocities are half-kicked, atoms in the user's order."""
+    """Differentiable state between two steps. Atoms are in the user's order, velocities at half steps."""
 
     x: Float[Array, "3 atoms"]
     v: Float[Array, "3 atoms"]

@@ -129,7 +129,7 @@ class Barostat(Integrator):
             raise InputError(message, where="dynamics.kind", remedy="Use nose-hoover, csvr or langevin")
 
     def motion(self, v: Vector, masses: Masses) -> Rate:
-        """Return Σ m v ⊗ v (an energy). For an isotropic box, return a third of the trace of this tensor."""
+        """Return Σ m v ⊗ v (an energy). For an isotropic box, return a third of the trace."""
         if not self.anisotropic:
             return 2 * super().kinetic(v, masses) / 3
         v = v.astype(jnp.float64)
@@ -164,9 +164,9 @@ class MTK(Barostat):
 
     Martyna, Tobias, Klein, J. Chem. Phys. 101, 4177 (1994), with the operator splitting of Tuckerman et al.,
     J. Phys. A 39, 5629 (2006), eq. 38 ff. A step applies chains, kick of the box, kick of the atoms and
-    drift, then the same operators in reverse. The inertia of the box is (N_f + 3) k_B T τ_p², for a full box
-    a third of this. An isotropic box has one degree of freedom, a full box six. The drift is exact for a
-    constant strain rate a: x(t) = x exp(a t) + v t exp(a t / 2) sinh(a t / 2) / (a t / 2).
+    drift, then the same operators in reverse order. The inertia of an isotropic box is (N_f + 3) k_B T τ_p²,
+    that of a full box a third of this. An isotropic box has one degree of freedom, a full box six. The drift
+    is exact for a constant strain rate a: x(t) = x exp(a t) + v t exp(a t / 2) sinh(a t / 2) / (a t / 2).
 
     Example:
         >>> mdnum.simulation(atoms, argon, cut, timestep=0.002, temperature=90, pressure=0.0,

@@ -1,10 +1,10 @@
 """Sums over the neighbors of every atom. XLA calls one compiled loop on a CPU.
 
 jax traces a function of one pair. The operations are written as LLVM text for vectors of eight atoms. The
-data of each atom are contiguous. Loading a neighbor thus takes one or two instructions. The terms of eight
-neighbor slots are summed in registers. XLA's own loop gathers neighbor data and computes terms in separate
-passes. No operation is contracted or reordered. Equal input thus gives equal output on every processor.
-XLA calls the loop through its foreign-function interface (xla/ffi/api/c_api.h, version 0.3).
+data of each atom are contiguous in memory. Loading a neighbor thus takes one or two instructions. The terms
+of eight neighbor slots are summed in registers. XLA's own loop gathers neighbor data and computes terms in
+separate passes. No operation is contracted or reordered. Equal input thus gives equal output on every
+processor. XLA calls the loop through its foreign-function interface (xla/ffi/api/c_api.h, version 0.3).
 """
 
 from __future__ import annotations

@@ -3,7 +3,7 @@
 Every pair is evaluated twice, once for each atom. Each atom sums over its neighbors in a fixed order, without
 scattered writes. On a CPU in double precision, one compiled loop (`md.kernel`) computes the forces. On other
 devices, XLA evaluates one group of neighbor slots at a time. Decisions are packed into bits, so that
-temporary arrays fit in the cache. For 32,000 atoms, all slots at once would take ten times as long.
+temporary arrays fit in the cache. For 32,000 atoms, evaluating all slots at once takes ten times as long.
 """
 
 from __future__ import annotations
@@ -174,7 +174,7 @@ class PairForce(eqx.Module):
         return self.in_blocks(positions, tables, given, where, decisions=decisions, tensor=tensor)
 
     def in_one_loop(self, tables: Tables) -> bool:
-        """True if `kernel.over_pairs` can be used: double precision, few pair types, a CPU."""
+        """True if `kernel.over_pairs` can be used: in double precision, for few pair types, on a CPU."""
         roles = ("force", "decision", "accumulate")
         wide = {self.policy.geometry, *map(self.policy.dtype, roles)} == {np.dtype(np.float64)}
         few = tables.types is None or self.model.pair_types <= _FEW_TYPES

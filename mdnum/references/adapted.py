@@ -122,7 +122,7 @@ def morse(form: PairForm, begin: float, end: float) -> Calculator:
 
 
 def short_listed_eam(file: Path) -> Calculator:
-    """Return ASE's EAM with a short neighbor list. The default list, up to 2 (cutoff + skin), is slow."""
+    """Return ASE's EAM calculator with a short neighbor list. ASE's range of 2 (cutoff + skin) is slow."""
     from ase.calculators.eam import EAM
     from ase.neighborlist import NeighborList
 

@@ -141,7 +141,7 @@ class PairForm:
     compare: str  # what inside means: "r2 <", "r2 <=", "r <" or "r <="
 
     def inside(self, distance: Float[ndarray, "pairs"]) -> Bool[ndarray, "pairs"]:
-        """Return True for each distance inside the cutoff. The system file gives `<` or `<=`."""
+        """Return True for each distance inside the cutoff. The system file selects `<` or `<=`."""
         space, comparison = self.compare.split()
         quantity, threshold = (distance**2, self.r_cut**2) if space == "r2" else (distance, self.r_cut)
         return quantity <= threshold if comparison == "<=" else quantity < threshold

@@ -39,7 +39,7 @@ class Stays:
 
 
 def median(counts: Int[np.ndarray, "lengths"]) -> float | None:
-    """Return the median of a histogram of residence times (0, 1, 2, ... steps), or None."""
+    """Return the median of a histogram of residence times in steps. None if it is empty."""
     total = int(counts.sum())
     if not total:
         return None
@@ -125,7 +125,7 @@ class Scan:
 
     @property
     def alternates(self) -> bool:
-        """True if each pair enters and leaves the cutoff in turn. False if a flip is missing."""
+        """True if each pair alternately enters and leaves the cutoff. False if a flip is missing."""
         self._follow()
         return self._alternates
 
@@ -163,7 +163,7 @@ class Scan:
         )
 
     def matches(self, series: Mapping[str, np.ndarray]) -> Bool[np.ndarray, "steps"]:
-        """Return, for each step, whether the table has as many flips as the series."""
+        """Return, for each step, whether the table and the time series contain equally many flips."""
         return (self.entered == series["entered"]) & (self.left == series["left"])
 
     def _follow(self) -> None:
@@ -248,7 +248,7 @@ class Conservation:
         kinetic: Float[np.ndarray, "rows"],
         least: float,
     ) -> Conservation | None:
-        """Compute fluctuation and drift of the conserved energy. None for too few rows or atoms at rest.
+        """Compute fluctuation and drift of the conserved energy. None for too few rows, or for atoms at rest.
 
         The fluctuation does not include the linear trend. The first half of the run is omitted: atoms on
         lattice sites lose half of their kinetic energy at the start.
@@ -274,7 +274,7 @@ class Conservation:
 
 
 def range_table(label: Callable[[str], str], *tables: Mapping[str, np.ndarray]) -> Table:
-    """Tabulate the ranges of quantities, and the first steps outside narrower float formats.
+    """Tabulate the ranges of quantities, and when they first leave the range of narrower formats.
 
     Args:
         label: function that returns the label of a quantity from its name.

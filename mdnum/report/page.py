@@ -141,7 +141,7 @@ def in_words(table: Mapping[str, Any], units: Mapping[str, str] | None = None) -
 
 
 def flat(value: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, str]]:
-    """Yield (name, text) for each entry of nested tables. Plain values of a table share one text."""
+    """Yield (name, text) for each entry of nested tables. Plain values of a table are joined to one text."""
     for key, item in value.items():
         name = f"{prefix}{key}".replace("_", " ")
         if isinstance(item, Mapping):

@@ -159,7 +159,7 @@ def _noted(before, bits, index, x, v) -> Changes:
 
 @dataclass(frozen=True)
 class AmbiguousPairs(Columns):
-    """Pairs whose cutoff decision rounding errors could reverse. Each row is a pair at a step."""
+    """Pairs whose cutoff decision could be reversed by rounding errors. Each row is a pair at a step."""
 
     step: Int[np.ndarray, "rows"]  # of the decision
     # i, j: the pair, i < j
@@ -232,11 +232,11 @@ class PairRecorder:
         return np.concatenate([one.bounds_at(x[[row]]) for row, one in enumerate(each)])
 
     def ambiguous(self, segment: Segment) -> Int[np.ndarray, "rows"]:
-        """Number of pairs at each step whose decision rounding errors could reverse."""
+        """Number of pairs at each step whose decision could be reversed by rounding errors."""
         return np.bincount(self.doubtful(segment).step - segment.first, minlength=segment.rows)
 
     def doubtful(self, segment: Segment) -> AmbiguousPairs:
-        """Return the pairs whose decision rounding errors could reverse, sorted by step."""
+        """Return the pairs whose decision could be reversed by rounding errors, sorted by step."""
         parts = [AmbiguousPairs.none()]
         bounds, table, dtype = self.bounds(segment), segment.table, np.dtype(self.simulation.decider.dtype)
         # almost always no pair comes that close; where one does, the host looks again
@@ -338,7 +338,7 @@ class PairRecorder:
         return self._held_keys
 
     def _cannot_differ(self, segment: Segment) -> bool:
-        """Return True if both neighbor lists must have the same pairs inside the cutoff."""
+        """Return True if old and new neighbor list must have the same pairs inside the cutoff."""
         rule = self.simulation.rule
         if self._held_segment is None or not rule.safe:
             return False

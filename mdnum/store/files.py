@@ -113,7 +113,7 @@ def subfolder(root: Path, name: str) -> Path:
 def replacing(path: Path) -> Iterator[BinaryIO]:
     """Yield a temporary file that replaces the file at `path` when closed.
 
-    A symbolic link at `path` is replaced. The file behind the link is not changed.
+    A symbolic link at `path` is replaced. The file to which the link points is not changed.
     """
     if path.parent.name in SUBFOLDERS and path.parent.is_symlink():
         raise _linked(path.parent)
@@ -293,7 +293,7 @@ def update(
 
 
 def place(path: Path) -> tuple[Path, str]:
-    """Return the run folder of a file, and its name there."""
+    """Return the run folder of a file, and the file's name in this folder."""
     if path.parent.name in SUBFOLDERS and not (path.parent / NAME).exists():
         return path.parent.parent, f"{path.parent.name}/{path.name}"
     return path.parent, path.name

@@ -1,7 +1,7 @@
 """Execution of tasks by a `concurrent.futures.Executor`, by default in processes on all cores.
 
 An engine (executor) only starts worker processes. The folder of a sweep point shows whether the point was
-computed. A worker process that dies therefore loses only its current point.
+computed. If a worker process dies, only the point in progress is therefore lost.
 """
 
 from __future__ import annotations
@@ -234,7 +234,7 @@ def _ends_with(parent: int) -> dict[str, Any]:
 
 @contextmanager
 def opened(on: str | Executor | TaskEngine | None, workers: int | None) -> Iterator[TaskEngine]:
-    """Context manager: yield the engine for None (local processes), a dask address, a file or an executor.
+    """Context manager: yield the engine for a dask address, a file or an executor. None: local processes.
 
     An executor that the caller passes remains open.
 

@@ -11,7 +11,7 @@
 The address (folder name) of a point is the MD5 hash of its state point, as in signac. A point is computed in
 a temporary folder, which is then renamed. A killed process therefore leaves no partial result. To claim a
 point, a process creates a file with O_EXCL. Only one process succeeds. If the process ends without a result,
-another process creates the next claim.
+another process creates the next claim file.
 """
 
 from __future__ import annotations
@@ -221,7 +221,7 @@ class Workspace:
 
     @contextmanager
     def filling(self, address: str, point: Mapping[str, Any]) -> Iterator[Path]:
-        """Yield an empty folder. The folder becomes that of the point if the `with` block raises no error."""
+        """Yield an empty folder. The folder is kept for the point if the `with` block raises no error."""
         here = self.place / f".{address}.{socket.gethostname()}.{os.getpid()}"
         shutil.rmtree(here, ignore_errors=True)
         with disk_errors(here):

@@ -156,7 +156,7 @@ class _Moved:
         self.whole = np.where(whole, near, n).astype(np.int32)
 
     def by(self, vectors) -> list[Float[np.ndarray, "atoms 3"]]:
-        """Return positions with one atom moved by each vector. The last are the original positions."""
+        """Return positions with one atom moved by each vector. The last positions are the original ones."""
         x, moved = self.trial.x, np.arange(self.trial.n) == self.central
         return [*(x + np.outer(moved, vector) for vector in vectors[self.trial.pbc]), x]
 
@@ -179,7 +179,7 @@ class _Moved:
         return all(abs(trial.energy(x, idx, cell) - energy) <= allowed for x in moved)
 
     def follows(self) -> bool:
-        """Return True if the energy of a sheared box has the periodicity of the sheared box."""
+        """Return True if the energy is periodic with the lattice vectors of a sheared box."""
         trial = self.trial
         cell = trial.cell + trial.cell @ _SHEAR
         energy, push = trial.energy(idx=self.whole), np.abs(trial.there(idx=self.whole)[1]).max()
@@ -192,7 +192,7 @@ class _Moved:
 
 
 def _check(trial: Trial) -> None:
-    """Raise an error if energies or forces are wrong. Note properties of the function."""
+    """Raise an error if energies or forces are wrong. Store properties of the energy function."""
     n, rng, inside = trial.n, np.random.default_rng(0), trial.inside
     energy, wide = trial.there()[0], trial.energy()
 
@@ -387,7 +387,7 @@ def _adds(trial: Trial) -> bool:
 def _reach(trial: Trial) -> tuple[float | None, float]:
     """Return the largest distance at which neighbors exert forces, and the largest distance tested.
 
-    The first value is None if no tested distance has a force.
+    The first value is None if no force was found.
     """
     r_cut, (listed, placed, third) = trial.model.r_cut, _threes(trial)
     furthest = min(2 * r_cut, 0.49 * trial.width if trial.pbc.any() else np.inf)

@@ -1,6 +1,6 @@
 """Conversion of a simulation to plain tables, which are stored, hashed and compared.
 
-The tables have the keys of a system file, also for simulations from objects.
+The tables have the keys of a system file, also for simulations made from objects.
 """
 
 from __future__ import annotations

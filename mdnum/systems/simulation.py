@@ -226,7 +226,7 @@ class Simulation:
 
     @property
     def channels(self) -> int:
-        """Number of cutoff decisions per pair of atoms. Terms with equal cutoff radii share one."""
+        """Number of cutoff decisions per pair of atoms. Terms with equal cutoff radii share a decision."""
         return len(self.model.parts) if self.pairwise else 1
 
     @property

@@ -310,7 +310,7 @@ def _check_overlap(atoms: Atoms, cell: Cell, smallest: float, length: str) -> No
 def _nearest(
     atoms: Atoms, within: float
 ) -> tuple[Float64[np.ndarray, " atoms"], Int64[np.ndarray, " atoms"], int]:
-    """Find each atom's nearest neighbor within a distance, and count closer pairs."""
+    """Find each atom's nearest neighbor within a distance, and count the pairs within it."""
     from scipy.spatial import KDTree
 
     count = len(atoms)

@@ -93,8 +93,8 @@ def _flat(now: np.ndarray, before: np.ndarray, atoms: int, constant: bool) -> st
     """Describe the plane, line or point into which all atoms collapsed, or None.
 
     In a correct file, rippled sheets may become flat. A collapse is reported only if the earlier thickness
-    exceeded the distance of neighbors. If all atoms share a coordinate, a thickness of a fifth of the extent
-    is enough.
+    exceeded the distance between neighbors. If all atoms share a coordinate, a thickness of a fifth of the
+    extent is enough.
     """
     thin, middle, long = now <= _COLLAPSED * before
     if before[2] > 0 and (long if atoms > _FEW else now[2] == 0):

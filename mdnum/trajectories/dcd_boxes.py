@@ -91,7 +91,7 @@ class DcdBoxes:
                 yield number, x, cell
 
     def __call__(self, number: int, ts: Any) -> Float[np.ndarray, "3 3"] | None:
-        """Return the lattice vectors of a frame. None if MDAnalysis's are correct or set by the user."""
+        """Return a frame's lattice vectors. None if MDAnalysis's vectors are correct or set by the user."""
         vectors = self._vectors(number, self.convention) if self.convention == _MATRIX else None
         if vectors is None:
             return None

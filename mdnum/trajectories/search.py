@@ -44,7 +44,7 @@ _MOST_IMAGES_EACH, _MOST_REPEATED = 100, 2_000_000
 
 
 class Found(NamedTuple):
-    """Pairs found by a search, one per image, in any order."""
+    """Pairs found by a search, in any order. Each image of an atom forms a separate pair."""
 
     kind: int  # `INSIDE` or `DIRECTED`
     i: Int[np.ndarray, "pairs"]  # the center of a directed one, else either
@@ -127,7 +127,7 @@ def exact_square(x, home, i, j, n0, n1, n2, vectors):
 
 @njit
 def _settle(x, atoms, kind, square, radius, bound, found):
-    """Determine from stored coordinates which pairs near thresholds are inside; return smallest |margin|.
+    """Decide from stored coordinates which pairs near thresholds are inside. Return the smallest |margin|.
 
     In a directed search, squared distances are recomputed from stored coordinates.
     """

@@ -157,7 +157,7 @@ class Tracker:
         return Members(first, second, rank, distances)
 
     def thresholds(self) -> tuple[Float[np.ndarray, "atoms"], Float[np.ndarray, "atoms"]]:
-        """Return a directed rule's cutoff distances at the last frame. Atoms that are not centers get nan.
+        """Return a directed rule's cutoff distances at the last frame. nan for atoms that are not centers.
 
         Returns:
             (distance below which a neighbor stays one, distance below which another atom becomes a neighbor).

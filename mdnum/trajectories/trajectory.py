@@ -174,7 +174,7 @@ class Trajectory(ABC):
 
     @abstractmethod
     def decoded(self, number: int, raw: Any) -> Frame:
-        """Decode a raw frame of `raw_frames`. Units are those of `length` and `time`."""
+        """Decode a raw frame of `raw_frames`. The attributes `length` and `time` give the units."""
 
     def _behind(self) -> str | None:
         """Describe data after the last frame of the file. None if there is no such data."""

@@ -1,9 +1,9 @@
 """Unwrapping of atomic paths across box boundaries, and detection of discontinuities between frames.
 
-In each frame, wrapping must move atoms by lattice vectors of this frame. After other changes, the unwrapped
-path is wrong (von Bülow, Bullerjahn and Hummer, J. Chem. Phys. 153, 021101, 2020). Lattice vectors of the
-same frame remove a jump and preserve displacements (Bullerjahn, von Bülow, Heidari, Hénin and Hummer, J.
-Chem. Theory Comput. 19, 3406, 2023).
+In each frame, wrapping must move atoms by lattice vectors of this frame. If wrapping moves atoms differently,
+the unwrapped path is wrong (von Bülow, Bullerjahn and Hummer, J. Chem. Phys. 153, 021101, 2020). Lattice
+vectors of the same frame remove a jump and preserve displacements (Bullerjahn, von Bülow, Heidari, Hénin and
+Hummer, J. Chem. Theory Comput. 19, 3406, 2023).
 """
 
 from __future__ import annotations
@@ -68,7 +68,7 @@ class Unwrapping:
         }  # fmt: skip
 
     def _pairs(self, here: np.ndarray, there: np.ndarray, cell: np.ndarray) -> dict[str, Any]:
-        """Return relative changes of nearly constant distances, for pairs across a boundary and others."""
+        """Return relative changes of nearly constant pair distances, across a boundary and elsewhere."""
         images = np.rint(there - here)
         split = images.any(axis=1) | (np.floor(here) != np.floor(there)).any(axis=1)
         lengths = np.linalg.norm((there - here - images) @ cell, axis=1)

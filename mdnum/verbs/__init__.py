@@ -108,7 +108,7 @@ def home(kind: str) -> str:
 
 
 def schema(kind: str) -> dict[str, Any]:
-    """Return the JSON Schema of a kind of document. The default is that of answer.json.
+    """Return the JSON Schema of a kind of document. The default is the schema of answer.json.
 
     Raises:
         InputError: no installed verb makes such documents.

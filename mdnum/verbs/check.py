@@ -143,7 +143,7 @@ def temperature_findings(start: float, requested: float, atoms: int, unit: str) 
 
 
 def would_show(report: Any, units: Units) -> Iterator[str]:
-    """Yield a sentence for each difference from other codes, with the limit of an error."""
+    """Yield a sentence for each difference from other codes, with its tolerance."""
     from mdnum.references.energy_check import FORCE, ROUNDINGS
 
     if frames := getattr(report, "frames", ()):

@@ -131,13 +131,13 @@ class ComparisonView(FlipsView):
 
     @property
     def largest(self) -> tuple[str, str]:
-        """Largest distance between an atom's positions in both files, and how much rounding explains."""
+        """Largest distance between an atom's positions in the two files, and a bound on rounding."""
         table = self.table("apart")
         at = int(np.argmax(table["furthest"]))
         return self.length(float(table["furthest"][at])), self.length(float(table["bound"][at]))
 
     def frame(self, at: int | None) -> str:
-        """Format the index of a frame. Frame numbers are added if the two files differ."""
+        """Format the index of a frame. Frame numbers in the files are added if they differ."""
         if at is None:
             return "no frame"
         a, b = (int(self.table("apart")[f"number_{one}"][at]) for one in "ab")
@@ -220,7 +220,7 @@ def _in_short(view: ComparisonView, one: Mapping[str, Any]) -> str:
 
 
 def _evidence(view: ComparisonView) -> Iterator[str]:
-    """Yield sentences on differences in positions and in neighbor sets, and which came first."""
+    """Yield sentences on differences in positions and in neighbor sets, and on their order."""
     summary, (one, *others) = view.summary, view.summary["rules"]
     seed, beyond, first, values = summary["seed"], summary["beyond"], one["first"], view.values(one)
     if seed is not None:
@@ -248,7 +248,7 @@ def _evidence(view: ComparisonView) -> Iterator[str]:
 
 
 def _certain(one: Mapping[str, Any]) -> str:
-    """Tell when neighbor sets differ by more than rounding."""
+    """Return when neighbor sets differ by more than rounding explains."""
     if one["first"]["pairs"] > one["first"]["ambiguous"]:
         return "some"
     return "never" if one["certain"] is None else "later"

@@ -86,7 +86,7 @@ def as_python(in_memory: bool) -> Iterator[None]:
 
 
 def ending(stopped: InputError | None, interrupted: bool, in_memory: bool = False) -> dict[str, Any]:
-    """Return summary entries: whether all frames were read, and the error otherwise."""
+    """Return summary entries: whether all frames were read, and the error if not."""
     told = None if stopped is None else str(stopped)
     return {
         "stopped": in_python(told) if told and in_memory else told,

@@ -222,7 +222,7 @@ def _atoms(view: View, figure: Canvas) -> None:
 
 
 def _two_by_two(view: View) -> Iterator[Any]:
-    """Yield a table of the steps at which runs with arithmetic and decisions of A or B diverge."""
+    """Yield a table of divergence steps, for the arithmetic and the decisions of A or B."""
     s, unit = view.summary, view.units.length
     lines: dict[tuple[str, str], dict[str, str]] = {}
     for cell in s["table"]:

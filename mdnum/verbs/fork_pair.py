@@ -56,7 +56,7 @@ class PairQuestion:
 
 
 def last_step(system: Any, steps: int | None, most: int | None = None) -> int:
-    """Return the last step of a run. The default is that of the system file, at most `most`.
+    """Return the last step of a run. The default is the last step in the system file, at most `most`.
 
     Raises:
         InputError: steps is below 1.
@@ -204,7 +204,7 @@ def _numbers(made: Fork) -> dict[str, Any]:
 
 
 def _boxes(made: Fork, dates: Mapping[str, int | None]) -> dict[str, Any]:
-    """Return the strain between the boxes of two runs: maximum, at the end and at divergence."""
+    """Return the strain between the boxes of two runs: largest, final and at divergence."""
     if "strain" not in made.series:
         return {}
     strain, free = made.series["strain"], made.series["B"]
@@ -217,7 +217,7 @@ def _boxes(made: Fork, dates: Mapping[str, int | None]) -> dict[str, Any]:
 
 
 def _fit(fit: Any, separation: np.ndarray) -> dict[str, Any]:
-    """Return the fit exp(intercept + rate * step) to a distance, and the fitted steps."""
+    """Return the exponential fit to the distance between two runs, and the fitted steps."""
     if not np.isfinite(fit.rate):
         return dict.fromkeys(("rate", "r_squared", "first", "last", "intercept"))
     step = np.arange(fit.first, fit.last + 1)
@@ -226,7 +226,7 @@ def _fit(fit: Any, separation: np.ndarray) -> dict[str, Any]:
 
 
 def _predicted(made: Fork, summary: Mapping[str, Any]) -> dict[str, Any]:
-    """Use the distance or the Lyapunov exponent to predict the step at which two runs split."""
+    """Predict when two runs split, from their distance or from the Lyapunov exponent."""
     from mdnum.numerics.verdicts import expected
 
     exponent = summary.get("lyapunov")
@@ -391,7 +391,7 @@ def _exponent(made: Fork) -> dict[str, Any]:
 
 
 def _pinned(made: Fork, pin: str, separation: dict[str, Any]) -> dict[str, Any]:
-    """Repeat run B with decisions of run A. Return the result, or why it is impossible."""
+    """Repeat run B with the decisions of run A. Return the result, or why this is impossible."""
     from mdnum.forks.replays import parse_pin, pinned
 
     try:
@@ -408,7 +408,7 @@ def _pinned(made: Fork, pin: str, separation: dict[str, Any]) -> dict[str, Any]:
 
 
 def _minimal(made: Fork, log: Progress) -> dict[str, Any]:
-    """Return a smallest set of imposed decisions that keeps run B close to run A, if any."""
+    """Return a minimal set of imposed decisions that keeps run B close to run A."""
     from mdnum.forks.replays import disagreements, minimal_cause
 
     try:

@@ -1,8 +1,8 @@
 """Functions common to all verbs (the commands of mdnum).
 
-The module of a verb contains three functions. The verb fills an output folder. `judge` returns the folder's
-findings and a headline, `page` the sections of its page. The sentences are in a text file named after the
-module. A module declares its verb in one line:
+The module of a verb contains three functions. A function with the verb's name fills an output folder. `judge`
+returns the folder's findings and a headline, `page` the sections of its page. The sentences are in a text
+file named after the module. A module declares its verb in one line:
 
     KINDS = {"flips": Verb(judge, page)}
 

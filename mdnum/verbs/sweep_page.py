@@ -179,13 +179,13 @@ def _sections(view: View) -> Iterator[Section]:
 def _most(
     rows: Sequence[Any], columns: Mapping[str, str], stored: str, bad: Callable[[Any], Any] | None = None
 ) -> list[Any]:
-    """Return a table of the first rows. A note names the file if there are more."""
+    """Return a table of the first rows. If there are more rows, a note names the file with all rows."""
     more = [TEXTS("more_rows", shown=_ROWS, all=len(rows), stored=stored)] if len(rows) > _ROWS else []
     return [*more, table_of(rows[:_ROWS], columns, bad=bad)]
 
 
 def _several(words: Sequence[str], separator: str = ", ") -> str:
-    """Join words. Of many words, show the first three, the last, and their number."""
+    """Join words. Of many words, show the first three, the last, and the number of words."""
     if len(words) <= _VALUES:
         return separator.join(words)
     return TEXTS("many_values", first=separator.join(words[:3]), last=words[-1], n=len(words))
@@ -208,7 +208,7 @@ def _differences(view: View) -> list[Any]:
 
 
 def _with_error(row: Mapping[str, Any]) -> str:
-    """Format a value and its error. The error determines the digits."""
+    """Format a value and its error. The error determines the number of digits."""
     value, error = row["value"], row["error"]
     if not error:
         return number(value, 5)

@@ -51,8 +51,8 @@ class DynamicsCheck(AuditCheck):
     """Is the energy conserved in a short run at constant energy?
 
     The check reports the drift, its standard error, and the drifts due to integrator, flips and other causes.
-    Drift that neither flips nor the work of forces explain is the integrator's. At half the time step, the
-    integrator's drift must fall to a quarter.
+    Drift that neither flips nor the work of forces explain is due to the integrator. At half the time step,
+    the integrator's drift must fall to a quarter.
     """
 
     name, title, order, basic, calls = "dynamics", "Dynamics", 70, True, 1900
@@ -113,7 +113,7 @@ class DynamicsCheck(AuditCheck):
 
 
 def _aged(subject: CalculatorSubject, ran: NveRun, count: int, noise: NoiseFloor) -> tuple[float, float]:
-    """Return the largest change of energies with new calculators, and its limit (eV)."""
+    """Return the largest energy difference from new calculators, and its limit (eV)."""
     places = np.unique(np.linspace(0, len(ran.potential) - 1, count).astype(int))
     again = [subject.fresh().energy(ran.at(ran.positions[n])) for n in places]
     rounding = NoiseFloor(np.finfo(float).eps * largest(ran.potential), 0.0)
@@ -518,7 +518,7 @@ class RigidGroups:
                 return
 
     def adjust_forces(self, atoms: Atoms, forces: Float[np.ndarray, "atoms 3"]) -> None:
-        """Leave the forces unchanged. Constrained runs adjust the momenta."""
+        """Leave the forces unchanged. Only the momenta are adjusted in constrained runs."""
 
     def todict(self) -> dict[str, Any]:
         """Return the constraint as a dictionary in ASE's format for constraints."""

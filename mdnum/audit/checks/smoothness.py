@@ -186,7 +186,7 @@ def _jumps(walks: PairWalks, around: EnvironmentWalks, kT: float) -> Iterator[Ob
 
 
 def _at_cutoff(around: EnvironmentWalks, kT: float) -> Iterator[Observed]:
-    """Yield a finding if many atoms have a less smooth energy than two."""
+    """Yield a finding if the energy of many atoms is less smooth than that of two."""
     if not around.lower:
         return
     worst = min(

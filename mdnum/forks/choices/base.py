@@ -1,4 +1,4 @@
-"""The base class of numerical choices, and pairs of programs that differ in one."""
+"""The base class of numerical choices, and pairs of programs that differ in one choice."""
 
 from __future__ import annotations
 
@@ -280,7 +280,7 @@ class Summed(Choice):
 
     @property
     def must_hold(self) -> bool:  # type: ignore[override]
-        """True if the sums of both runs do not depend on order. The choice then has no effect."""
+        """True if sums of both runs do not depend on the order of terms. The choice then has no effect."""
         return self.both in ORDERLESS
 
     def twin(self, a: Any, b: Any, difference: str, frame: Any = None) -> Twin:

@@ -1,4 +1,4 @@
-"""The bouncing ball in exact arithmetic, for steps of sums and products."""
+"""The bouncing ball in exact arithmetic, for time steps that consist of sums and products."""
 
 from __future__ import annotations
 

@@ -2,8 +2,8 @@
 
 The contribution of a flip to a gradient is a product of two factors. The first factor is the derivative of
 the loss with respect to the cutoff distance of this flip alone. The effect of later flips is included. The
-second factor is the derivative of cutoff distance minus pair distance, without flips. The contributions of
-single flips add up to that of all flips.
+second factor is the derivative of cutoff distance minus pair distance, at fixed decisions. The contributions
+of single flips add up to that of all flips.
 
 A decision boundary lies between two adjacent floats of a parameter. Pair decisions differ between the two
 floats. Between two boundaries, decisions are constant. Loss and gradient are smooth. Gradients on both sides

@@ -1,13 +1,13 @@
 """Growth of gradients and perturbations with the number of steps.
 
 The cotangent of a state is the gradient of a run that starts from this state. One reverse pass over T steps
-therefore gives gradients for all run lengths (horizons) up to T. Each gradient has a different start.
+therefore gives gradients for all run lengths (horizons) up to T. Each of these runs has a different start.
 Cotangents of a chaotic run span many powers of two. Scaling the loss helps only if the narrow format covers
 this range.
 
-The largest singular value of a run's Jacobian bounds the gradient of a loss of the last state. Singular
-values are computed by subspace iteration with a random block (Halko, Martinsson and Tropp 2011). The block is
-orthonormalized after every stretch of steps.
+The largest singular value of a run's Jacobian bounds the gradient of a loss that depends only on the last
+state. Singular values are computed by subspace iteration with a random block (Halko, Martinsson and Tropp
+2011). The block is orthonormalized after every stretch of steps.
 """
 
 from __future__ import annotations
@@ -109,8 +109,8 @@ class GrowthWatch:
                 self.gradient[name][first + row] = value
 
     def result(self, whole: dict[str, Float[np.ndarray, "..."]]) -> GradientGrowth:
-        """Return the norms of the gradient by horizon, and their growth rate. The last row is the gradient of
-        the whole run. The other rows omit how the loss depends on the first frame.
+        """Return the norms of the gradient by horizon, and their growth rate. The last row refers to the
+        gradient of the whole run. The other rows omit how the loss depends on the first frame.
         """
         units = self.simulation.units
         timestep = float(self.simulation.integrator.timestep)
@@ -460,7 +460,7 @@ def _defect(start, there: TangentImage, back: TangentImage) -> float:
 
 
 def _svd(image: TangentImage) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return log singular values and singular vectors (left, right) of a Jacobian on a block."""
+    """Return singular values (logarithms) and left and right singular vectors of a Jacobian."""
     diagonal = image.stretches[-1]
     if diagonal.max() - diagonal.min() > _RANGE:
         # rounding has eaten the small ones in the product; the block is aligned, so its diagonal has them

@@ -98,7 +98,7 @@ class Case:
         return replace(self, stills=stills, known=None if self.known is None else _among(self.known, atoms))
 
     def changed(self, positions: Any = None, cell: Any = None, **other: Any) -> Case:
-        """Return the test case with functions applied to positions and cell of each call."""
+        """Return the test case with positions and cells changed by the given functions."""
         same = lambda rows: rows  # noqa: E731
         x, box = positions or same, cell or same
         stills = tuple(replace(one, positions=x(one.positions), cell=box(one.cell)) for one in self.stills)

@@ -4,7 +4,7 @@ Two atoms start just beyond r_cut + padding. After they approach by the padding,
 The smallest such motion is along the line between the atoms. A rebuild criterion must detect every approach
 of two atoms by the padding. Each sequence brings a pair closer by slightly more than the padding. Sequences
 differ in direction (axis, diagonal, random), in the division of the motion between the two atoms, and in time
-(one step, slowly, back and forth). Other atoms are absent, at rest, move slightly, or drift together.
+(one step, slowly, back and forth). There are no other atoms, or they rest, move slightly or drift together.
 """
 
 from __future__ import annotations
@@ -45,7 +45,7 @@ def movers() -> Iterator[Case]:
 
 
 def sequences() -> Iterator[Case]:
-    """Yield sequences for a list that is built at each call, to test that it keeps no state."""
+    """Yield sequences for a neighbor list that is built at each call and must not keep a state."""
     for case in _reuse():
         yield replace(case, skin=0.0)
 
@@ -203,7 +203,7 @@ def _reuse() -> Iterator[Case]:
 
 
 def _anew(name: str, path: list[Any], skins: Sequence[float | None] | None = None) -> Case:
-    """Return a test case with a new list at every step, or where `skins` gives a skin."""
+    """Return a test case with a new neighbor list at every step, or at steps with a skin in `skins`."""
     case = sequence(name, "reuse", path, _L, _R, max(filter(None, skins)) if skins else _SKIN)
     starts = zip(case.stills, skins or [None] * len(path), strict=True)
     stills = (replace(still, fresh=skin is not None or not skins, skin=skin) for still, skin in starts)
@@ -278,7 +278,7 @@ def _closing(room: float) -> float:
 
 
 def _around(middle: ndarray, room: float | ndarray, way: ndarray) -> ndarray:
-    """Return pairs just beyond r_cut + padding: all first atoms, then all partners."""
+    """Return positions of pairs just beyond r_cut + padding: first atoms, then their partners."""
     half = (_R + (1 + HAIR) * room) / 2 * way
     return np.vstack([middle - half, middle + half])
 
@@ -286,7 +286,7 @@ def _around(middle: ndarray, room: float | ndarray, way: ndarray) -> ndarray:
 def _walk(
     room: float, way: ndarray, share: float, edge: float, n: int, closed: Iterable[float] = (0.0, 1.0)
 ) -> list[ndarray]:
-    """Return a path of two approaching atoms. The first moves by the fraction `share`."""
+    """Return a path of two approaching atoms. The first atom makes the fraction `share` of the motion."""
     start = _around(edge * np.random.default_rng(150 + n).uniform(0.2, 0.8, 3), room, way)
     moves = _closing(room) * np.array([share * way, (share - 1.0) * way])
     return [start + part * moves for part in closed]
@@ -398,7 +398,7 @@ def _places(count: int, edge: float, n: int) -> ndarray:
 
 
 def _sequence(name: str, paths: Iterable[list[Any]], cell: float | ndarray, skin: float = _SKIN) -> Case:
-    """Return a test case of successive motions. Large moves between them force a rebuild."""
+    """Return a test case of successive motions. Large moves between these motions force a rebuild."""
     paths = list(paths)
     case = sequence(name, "rule", [still for path in paths for still in path], cell, _R, skin)
     return replace(case, motions=len(paths))

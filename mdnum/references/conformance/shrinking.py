@@ -98,7 +98,7 @@ def _sensible(case: Case) -> bool:
 
 
 def _simplifications(case: Case) -> Iterator[Callable[[Case], Case]]:
-    """Yield functions that simplify a test case, such as fewer digits."""
+    """Yield functions that simplify a test case, for example by removing digits."""
     for axis in range(3):
         yield lambda case, axis=axis: replace(
             case, pbc=tuple(on and n != axis for n, on in enumerate(case.pbc)), known=None
@@ -128,7 +128,7 @@ def _simplifications(case: Case) -> Iterator[Callable[[Case], Case]]:
 
 
 def deepest(failures: Failures, failed: Failed) -> Failed:
-    """Move the atoms of a missing pair closer while the list omits the pair.
+    """Move the atoms of a missing pair closer together while the list omits the pair.
 
     All atoms move along their displacement between the first two calls of the list. The failure then shows
     the smallest distance of a pair that the list omits.
