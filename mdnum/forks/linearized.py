@@ -92,7 +92,7 @@ def tangents(
     if not isinstance(force, PairForce):
         raise InputError(
             "pair decisions cannot be imposed on a many-body potential",
-            remedy="Linearize a system with a pair potential",
+            remedy="Use a system with a pair potential",
         )
     dtype, clock = simulation.policy.dtype("state"), _CLOCK * float(simulation.integrator.timestep)
     shift = 0.0
