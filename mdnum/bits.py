@@ -90,7 +90,7 @@ def count_set(packed: UInt8[np.ndarray, "..."]) -> int:
 
 @njit
 def digit_order(room, count, most):
-    """Return the order that sorts integer keys (0 <= key < `most`). The sort is stable.
+    """Return the indices that sort integer keys (0 <= key < `most`). The sort is stable.
 
     The keys are in row 0 of `room`, an int64 array of shape (4, count or more). `room` is overwritten.
     """

@@ -49,7 +49,7 @@ class Program(Protocol):
     def imposable(self) -> str | None: ...
 
     def check(self, other: Any) -> None:
-        """Raise an error if two programs differ in numbers of atoms or balls, or kinds of decisions.
+        """Raise an error if two programs differ in the number of atoms or balls, or in kinds of decisions.
 
         Raises:
             InputError: the programs cannot be compared.

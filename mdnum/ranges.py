@@ -33,7 +33,7 @@ def columns(quantities: Mapping[str, Any]) -> dict[str, np.ndarray]:
 
 
 def first_outside(most: Any, least: Any, name: str) -> dict[str, tuple[int, float]]:
-    """Return the first values of a quantity that a floating-point format cannot represent.
+    """Return the first values of a quantity that are outside the range of a format.
 
     Returns:
         row and number that would first be infinite ("overflows"), lose digits ("subnormal") or be 0 ("lost");

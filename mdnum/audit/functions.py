@@ -116,7 +116,7 @@ def _ends(cutoff: Any, shared: PairPotential) -> Callable[..., Any]:
 
 
 def _order(derivatives: np.ndarray) -> int:
-    """Return the order of the last continuous derivative of energy at the cutoff. -1 if the energy jumps."""
+    """Return the order of the highest continuous energy derivative at the cutoff. -1 if the energy jumps."""
     for order, row in enumerate(derivatives):
         usual = float(np.median(np.abs(row[np.isfinite(row)]))) if np.isfinite(row).any() else 0.0
         if not abs(row[-1]) <= _NOTHING[min(order, 1)] * usual:

@@ -194,7 +194,7 @@ def scatter(values: Float[np.ndarray, "points columns"]) -> Float[np.ndarray, "c
 def order_change(
     subject: CalculatorSubject, atoms: Atoms, noise: NoiseFloor, rng: np.random.Generator
 ) -> tuple[float, NoiseFloor]:
-    """Reorder the atoms. Return the largest energy change (eV), and the noise if rounding explains it.
+    """Reorder the atoms. Return the largest energy change (eV) and its noise.
 
     The noise is 0 if rounding does not explain the energy change. The noise is also 0 if the changes are
     within the given `noise`. Along a line, a rounding error varies randomly. An error due to missing terms
@@ -252,7 +252,7 @@ def in_order(
 
 
 def _odd_one(values: Float[np.ndarray, "points"]) -> int:
-    """Return the index of the point whose removal leaves the best parabola."""
+    """Return the index of the point whose removal most improves the fit of a parabola."""
     at = np.arange(len(values)) - len(values) // 2
     # of values that are all large, what they have in common has no digits to spare
     values = values - np.median(values)
@@ -287,8 +287,8 @@ def settled(
 ) -> tuple[Atoms, NoiseFloor]:
     """Displace atoms slightly, away from distance thresholds. Return the structure and its noise.
 
-    In a perfect crystal, a whole neighbor shell can lie exactly at a cutoff. An energy jump would be counted
-    as noise. Of several random displacements, the one with the least noise is therefore used.
+    In a perfect crystal, a whole neighbor shell can lie exactly at a cutoff. An energy jump there would
+    count as noise. Of several random displacements, the one with the least noise is therefore used.
 
     Args:
         at_least: minimum number of atoms; a smaller periodic cell is repeated.

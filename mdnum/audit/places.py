@@ -41,7 +41,7 @@ class WrongPlaces:
 
 
 def wrong_places(subject: CalculatorSubject, atoms: Atoms, allowed: NoiseFloor) -> WrongPlaces | None:
-    """Find places in the list of atoms with wrong results, by exchanging like atoms.
+    """Exchange like atoms to find places in the list of atoms with wrong results.
 
     Exchanging two like atoms between correct places changes neither energy nor forces. An error tied to a
     place appears there for any order of the atoms. Other errors depend on the order of all atoms, such as a
@@ -75,7 +75,7 @@ def _wrong_places(subject: CalculatorSubject, atoms: Atoms, allowed: NoiseFloor)
 def _at_places(
     subject: CalculatorSubject, atoms: Atoms, order: np.ndarray, places: Sequence[int], allowed: NoiseFloor
 ) -> dict[int, tuple[bool, bool]]:
-    """Test whether energy and forces change if two atoms are exchanged, one of them at a correct place.
+    """Test whether energy and forces change if an atom is exchanged with one at a correct place.
 
     Returns:
         for each tested place, whether energy and forces change; empty if most places of a species are wrong.

@@ -21,7 +21,7 @@ _INSIDE = (0.02, 0.1, 0.25)  # Å inside the cutoff at which they are asked abou
 
 
 class SequenceStep(NamedTuple):
-    """A structure of a sequence, its change, and whether its results are checked."""
+    """A structure in a sequence, a description, and whether the results are checked."""
 
     what: str
     atoms: Atoms
@@ -67,7 +67,7 @@ def _sizes(atoms: Atoms, rng: np.random.Generator) -> Iterator[tuple[str, Atoms]
 
 
 def _slow_drift(atoms: Atoms, rng: np.random.Generator) -> Iterator[tuple[str, Atoms]]:
-    """Yield structures whose atoms move in small steps. The sum exceeds a neighbor-list skin."""
+    """Yield structures whose atoms move in small steps. The total exceeds a neighbor-list skin."""
     heading = rng.standard_normal((len(atoms), 3))
     heading /= np.linalg.norm(heading, axis=1)[:, None]
     yield "the structure", atoms

@@ -49,7 +49,7 @@ class BallProgram:
 
     @property
     def steps(self) -> int:
-        """Number of time steps that the system file gives."""
+        """Number of time steps in the system file."""
         return self.problem.steps
 
     @property
@@ -101,7 +101,7 @@ class BallProgram:
             )
 
     def run(self, steps: int, decisions: BallDecisions | None = None) -> BallRun:
-        """Run the simulation. The result has the balls in the order of the other run.
+        """Run the simulation. In the result, balls are in the order of the other run.
 
         Args:
             decisions: decisions imposed on the balls in that order; None for the program's own decisions and
@@ -191,7 +191,7 @@ class BallProgram:
         return found
 
     def nudged(self, size: float, count: int, seed: int) -> list[BallProgram]:
-        """Return programs with random changes of the initial heights, at most max(`size`, `ulp`)."""
+        """Return programs whose initial heights are changed randomly by at most max(`size`, `ulp`)."""
         rng = np.random.default_rng(seed)
         y = np.asarray(np.atleast_1d(self.problem.y0), np.float64)
         size = max(size, self.ulp)
@@ -199,7 +199,7 @@ class BallProgram:
         return [replace(self, problem=replace(self.problem, y0=y0)) for y0 in moved]
 
     def decision(self, other: BallProgram, flips: Sequence[CrossDecision], separation: float) -> Decision:
-        """Return the first differing decision of two runs. At equal steps, contacts precede stops."""
+        """Return the first differing decision of two runs. Within one step, contacts precede stops."""
         first = flips[0]
         return Decision(
             channel=first.channel,

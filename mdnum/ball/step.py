@@ -266,7 +266,7 @@ class Contact(Protocol):
         ...
 
     def acceleration(self, y: Balls, v: Balls, free: Balls, contact: Touching, r: Rounding) -> Balls:
-        """Return the acceleration of a state. Some schemes use this acceleration again in the next step."""
+        """Return the acceleration of each ball. Some schemes use this acceleration again in the next step."""
         ...
 
 

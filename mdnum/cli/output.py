@@ -151,7 +151,7 @@ def print_table(title: str, columns: Sequence[str], rows: Iterable[Sequence[Any]
 
 
 def print_records(title: str, records: Sequence[Mapping[str, Any]]) -> None:
-    """Print a table of records. Few records with many fields are transposed."""
+    """Print a table of records. If few records have many fields, the table is transposed."""
     columns = list(dict.fromkeys(key for record in records for key in record))
     rows = [[record.get(column) for column in columns] for record in records]
     if len(rows) > _FEW or len(columns) <= _MANY:

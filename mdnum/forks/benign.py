@@ -131,7 +131,7 @@ def two_of_three(rate: float) -> float:
 
 
 def bounds(count: int, of: int) -> tuple[float, float]:
-    """Compute the exact (Clopper-Pearson) 95 % confidence interval of a rate, `count` of `of`."""
+    """Compute the exact (Clopper-Pearson) 95 % confidence interval of the rate `count` / `of`."""
     tail = 0.025
     low = betaincinv(count, of - count + 1, tail) if count else 0.0
     high = betaincinv(count + 1, of - count, 1 - tail) if count < of else 1.0
@@ -171,7 +171,7 @@ class Window:
 
     @property
     def power(self) -> float:
-        """Smallest score/limit ratio of changes that must be detected. Infinity without changes."""
+        """Smallest ratio of score to limit of changes that must be detected. Infinity without changes."""
         return min((score for one in self.table if one.must_fail for score in one.scores), default=np.inf)
 
     @property
@@ -283,7 +283,7 @@ def calibrate(
 
 
 def choose(windows: Sequence[Window], name: str) -> Window:
-    """Return the latest step at which all deliberate changes are detected well, or the most sensitive step.
+    """Return the latest step that detects all deliberate changes well, otherwise the most sensitive.
 
     Raises:
         InputError: at no step are the deliberate changes distinguishable from rounding.

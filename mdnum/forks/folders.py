@@ -1,7 +1,7 @@
 """Find where two finished runs diverge, from their folders alone.
 
-The first differing decision and the first differing bits are found. No run is repeated. To compare positions,
-`twin_of` rebuilds the programs, `fork` repeats runs.
+The first differing decision and the first differing bits are found. No run is repeated. To compare
+positions, rebuild the programs with `twin_of`, and repeat the runs with `fork`.
 
 Atoms, box, potential and contact model of both systems must agree. Runs may differ in any other parameter or
 numerical choice.
@@ -147,10 +147,10 @@ def simulation_in(folder: Path, objects: Sequence[Simulation] = (), *, built: bo
 
 
 def twin_of(found: FolderFork, objects: Sequence[Simulation] = ()) -> Twin:
-    """Rebuild the programs of two molecular-dynamics runs from their folders (`objects`: see
-    `simulation_in`).
+    """Rebuild the programs of two molecular-dynamics runs from their folders.
 
-    Repeated runs have the stored bits if versions and processor are the same.
+    `simulation_in` describes `objects`. Repeated runs have the stored bits if versions and processor are the
+    same.
     """
     difference = "; ".join(f"{key}: {one} and {other}" for key, one, other in found.differences[:3])
     a, b = alike(*(simulation_in(path, objects) for path in (found.a, found.b)))
@@ -194,7 +194,7 @@ def _compared(first: RunFolder, second: RunFolder, where: str) -> FolderFork:
 
 
 def _of_frames(first: RunFolder, second: RunFolder, where: str) -> FolderFork:
-    """Find the first step at which two trajectories or loops differ in a decision."""
+    """Find the first frame at which two trajectories or recorded loops differ in a decision."""
     summaries, names = (first.summary, second.summary), ("rule", "i", "j", "rank")
     rules, between = ([each[name] for each in summaries] for name in ("rules", "between"))
     names_of = [", ".join(one["rule"] for one in each) for each in rules]
@@ -247,7 +247,7 @@ def _different(one: Mapping[str, Any], other: Mapping[str, Any]) -> list[Differe
 def _alone(
     first: RunFolder, second: RunFolder, table: str, labels: tuple[str, ...], steps: int, clock: str = "step"
 ) -> tuple[int | None, list[StoredFlip]]:
-    """Return the first step with flips that only one of two tables contains, and these flips."""
+    """Return the flips that only one table contains, at the first step with such flips."""
     known = [folder.table(table, rows=1).column_names for folder in (first, second)]
     names = (clock, *labels, "entered", *["terms"] * all("terms" in one for one in known))
     further = ("distance", "ambiguous") if table == "flips" else ()
@@ -356,7 +356,7 @@ def _starts(first: RunFolder, second: RunFolder, programs: list[Difference], whe
 
 
 def _same_system(one: Any, other: Any) -> Iterator[tuple[bool, str]]:
-    """Compare two sets of atoms. For each property, yield whether the two sets agree, and a message."""
+    """Compare two sets of atoms. For each property, yield whether it agrees, and a message."""
     yield len(one) == len(other), f"numbers of atoms differ, {len(one)} and {len(other)}"
     symbols = [each.get_chemical_symbols() for each in (one, other)]
     yield symbols[0] == symbols[1], "species or their order differ"

@@ -81,8 +81,8 @@ class _Settled(eqx.Module):
 class Implicit(BallMethod):
     """Gradient method: derivative of the fixed point of the contact.
 
-    The loss uses the executed iterations. The derivative is that of the limit of the iterations. For the gain
-    k, `unrolled` gives a nonzero derivative, an artifact of the tolerance.
+    The loss uses the executed iterations. The derivative is that of the limit of the iterations. Due to the
+    tolerance, `unrolled` gives a nonzero derivative with respect to the gain k.
     """
 
     regularization: float = 0.0  # added to 1 - dG/dy, for a gain too small to divide by

@@ -136,7 +136,7 @@ class Custom(Loss):
 
 
 class ComplexPart(Loss):
-    """The real part of a complex loss times a constant factor. Factor -i gives the imaginary part."""
+    """Real part of the product of a complex loss and a constant. The constant -i gives the imaginary part."""
 
     name = "part of a complex loss"
     inner: Loss = eqx.field(kw_only=True)

@@ -76,7 +76,7 @@ def with_quantities(force: PairForce | ManyBodyForce, values: Any) -> PairForce 
 
 
 def onto_start(simulation: Simulation, start: Any, extra: Any) -> tuple[Any, Array, Array]:
-    """Propagate derivatives of the extra state of step 0 to parameters, positions and velocities.
+    """Propagate derivatives of the integrator's initial state to parameters, positions and velocities.
 
     Args:
         start: the state of step 0.
@@ -126,7 +126,7 @@ def resolve(simulation: Simulation, words: Sequence[str]) -> tuple[str, ...]:
 
 
 def _places(simulation: Simulation, name: str) -> list[tuple[Callable[[Any], Any], Any]]:
-    """Return a selector and the derivative of each input that depends on a parameter."""
+    """For each input that depends on a parameter, return a selector and the derivative."""
     if name in ("initial.positions", "initial.velocities"):
         return [((lambda of: of.x) if name == "initial.positions" else (lambda of: of.v), None)]
     v = simulation.velocities.T
@@ -214,7 +214,7 @@ def gathered(
 
 
 def directions(simulation: Simulation, columns: Sequence[ParameterEntry]) -> Direction:
-    """Return derivatives of a simulation's inputs with respect to parameter entries (first axis)."""
+    """Return derivatives of a simulation's inputs. The first axis is the parameter entry."""
     nothing = jnp.zeros((3, simulation.atoms), simulation.policy.dtype("state"))
     still = Direction(
         nothing,

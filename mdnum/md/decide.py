@@ -266,7 +266,7 @@ class SlotJudge:
 
 
 def displacements(components, cell: Cell, j):
-    """Return minimum-image vectors x_j - x_i by component. Empty slots get valid indices."""
+    """Return minimum-image vectors x_j - x_i by component. For empty slots, j is any valid index."""
     return cell.minimum_image(*(c.at[j].get(mode="promise_in_bounds") - c for c in components))
 
 

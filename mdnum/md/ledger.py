@@ -94,6 +94,6 @@ class FlipTable(Columns):
     by_box: Float[np.ndarray, "flips"] | Any = None
 
     def columns(self, rule: int = 0) -> dict[str, Any]:
-        """Return the known columns as named in flips.parquet, and a column with the rule's index."""
+        """Return the known columns, named as in flips.parquet, and a column of rule indices."""
         known = {name: column for name, column in vars(self).items() if column is not None}
         return {"rule": np.broadcast_to(np.int32(rule), len(self)), **known}

@@ -16,7 +16,7 @@ from mdnum.md.jaxmd import NeighborList
 
 @dataclass(frozen=True)
 class Smoothness:
-    """Smoothness of the energy as a function of a pair distance at r_cut."""
+    """Smoothness at r_cut of the energy as a function of a pair distance."""
 
     # continuous derivatives of the energy at r_cut: -1 where the energy itself jumps, 0 where only the force
     # does, math.inf where every derivative vanishes
@@ -128,7 +128,7 @@ def quantities_of(potential: Any) -> dict[str, Any]:
 
 
 def with_quantities(potential: Any, values: Mapping[str, Any]) -> Any:
-    """Return a copy of the potential with other parameter values (also inside jit)."""
+    """Return a copy of the potential with other parameter values. Also works inside jit."""
     names, tree = list(leaves_by_path(potential)), jax.tree.structure(potential)
     leaves = [values.get(name, leaf) for name, leaf in zip(names, jax.tree.leaves(potential), strict=True)]
     whole = jax.tree.unflatten(tree, leaves)

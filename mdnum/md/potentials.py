@@ -81,11 +81,11 @@ class PairPotential(eqx.Module):
 
     @property
     def typed(self) -> PairPotential:
-        """The potential with every per-species parameter as two values per pair type."""
+        """The potential, with two values per pair type for every per-species parameter."""
         return self
 
     def split(self) -> tuple[Any, Any]:
-        """Return two copies. The first has the parameters per pair type, the second the shared parameters."""
+        """Return two copies: one with the parameters per pair type, one with the shared parameters."""
         return self, jax.tree.map(lambda _: None, self)
 
     @property
@@ -348,7 +348,7 @@ class Together(Cutoff):
 
 
 class CutPotential(eqx.Module):
-    """Pair potential with a cutoff, or a sum with the same cutoff decision for each pair."""
+    """Pair potential with a cutoff, or a sum of terms with one cutoff decision per pair."""
 
     potential: PairPotential  # bare potential, parameters per pair type
     cutoff: Cutoff = eqx.field(static=True)  # how it ends
@@ -399,7 +399,7 @@ class CutPotential(eqx.Module):
 
     @property
     def typed(self) -> CutPotential:
-        """The potential with every per-species parameter as two values per pair type."""
+        """The potential, with two values per pair type for every per-species parameter."""
         return replace(self, potential=self.potential.typed)
 
     def at_cutoff(self) -> AtCutoff:

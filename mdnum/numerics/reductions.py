@@ -165,7 +165,7 @@ class FixedPoint(Reduction):
 
 
 def _numbered(reduction: Callable[[int], Reduction], default: int) -> Callable[..., Reduction]:
-    """Return a function that creates a summation order from the text of its parameter."""
+    """Return a function that creates a summation order from its parameter, given as text."""
 
     def make(number: str | None = None) -> Reduction:
         try:

@@ -118,7 +118,7 @@ class CrossFlip:
 
 @dataclass(frozen=True)
 class PairFlips(Columns):
-    """Flips in one of two runs, as columns, with the labels of the first run."""
+    """Columns of the flips in one of two runs, with the labels of the first run."""
 
     step: Int[np.ndarray, "flips"]  # of the flip
     key: Int[np.ndarray, "flips"]  # i * atoms + j of the pair, i < j
@@ -296,7 +296,7 @@ def separations(
     b: Float[np.ndarray, "rows 3 atoms"],
     others: Sequence[Cell] = (),
 ) -> Float[np.ndarray, "rows"]:
-    """Return, by step, the largest distance between an atom's positions in two runs (or NaN).
+    """Return the largest distance of an atom between two runs, by step. NaN if positions are not finite.
 
     Args:
         cells: the box, or one box for each row; distances are minimum-image distances.

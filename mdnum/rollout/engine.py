@@ -85,7 +85,7 @@ class Segment:
         return self.first + self.rows - 1
 
     def rows_of(self, name: str) -> np.ndarray:
-        """Return a quantity at all steps, recomputed if it was not recorded."""
+        """Return a quantity at all steps of the segment. Unrecorded quantities are recomputed."""
         lacks = self.changes is not None and name in ("x", "v", "images", "bits")
         return np.asarray(getattr(self.again() if lacks else self.record, name))[: self.rows]
 
@@ -270,7 +270,7 @@ class Engine:
         return empty_record(rows, words, self.simulation.atoms, dtype, self.record, *rest)
 
     def give(self, turn: int, record: EpochRecord) -> None:
-        """Return a record to the engine for use as a buffer."""
+        """Give a record back to the engine, which uses it as a buffer."""
         self._records[turn] = record
 
     def segments(self) -> Iterator[Segment]:
@@ -339,7 +339,7 @@ class Engine:
     def _segment(
         self, listed, start: Start, held, turn: int, begun: tuple[EpochOutcome, EpochRecord]
     ) -> tuple[Segment, np.ndarray | jax.Array | None]:
-        """Wait for the compiled loop. Return its recorded steps, and the decisions at its last step."""
+        """Wait for the compiled loop. Return the recorded steps, and the decisions at the last step."""
         outcome, record = begun
         rows, rebuild, finite, _ = np.asarray(outcome.flags).tolist()
         while (changes := record.changes) is not None and finite and changes.found > len(changes.pairs):

@@ -77,7 +77,7 @@ class PressureParts:
         self.samples.append(parts)
 
     def summary(self) -> dict[str, Any] | None:
-        """Return pressures (user units) with standard errors and cutoff corrections; None without samples.
+        """Return pressures, in user units, with standard errors and cutoff corrections. None without samples.
 
         Standard errors assume independent samples. The cutoff correction uses the mean volume.
         """

@@ -62,7 +62,7 @@ _EDITED = (SYSTEM_FILE, "log.txt")
 
 
 def system_tables(file: Path) -> dict[str, Any]:
-    """Return the tables of system.toml in a run folder, or of the simulation's description.
+    """Return the tables of a system.toml, or of another description of a simulation.
 
     Raises:
         FolderError: the file is not valid TOML or JSON.
@@ -747,7 +747,7 @@ def restoring(path: Path) -> Iterator[None]:
 
 
 def expect(right: object, seen: str) -> None:
-    """Raise an error if a restored value is not as expected, for use inside `restoring`.
+    """Raise an error if a restored value is invalid. Use this function inside `restoring`.
 
     Raises:
         ValueError: the condition is false.

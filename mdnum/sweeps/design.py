@@ -1,7 +1,7 @@
 """Design of a sweep: the varied choices, their values, and the points to run.
 
-A choice is a key of the system file, or a name for several keys (`precision`). Values of a choice are written
-as in a system file.
+A choice is a key of the system file, or a name for several keys (such as `precision`). Values of a choice
+are written as in a system file.
 """
 
 from __future__ import annotations
@@ -42,7 +42,7 @@ class Axis:
         return all(isinstance(one, int | float) and not isinstance(one, bool) for one in self.values)
 
     def settings(self, value: Any, world: str = "md") -> dict[str, Any]:
-        """Return the keys and values of the system file for a value of this choice."""
+        """Return the system-file keys and values that belong to a value of this choice."""
         if self.key == "precision" and isinstance(value, str):
             return {f"precision.{role}": value for role in _ROLES[world]}
         return {self.key: value}
@@ -111,7 +111,7 @@ def _range(text: str, low: Any, high: Any, step: Any) -> tuple[Any, ...]:
 
 
 def with_base(axis: Axis, base: Any) -> Axis:
-    """Return an axis with the base value among its values. Numbers are sorted."""
+    """Return the axis, with the value of the unchanged system added. Numbers are sorted."""
     same = [one for one in axis.values if one == base and type(one) is not bool]
     values = axis.values if same else (base, *axis.values)
     made = Axis(axis.key, values)

@@ -1,6 +1,6 @@
 """System files: their schema, and how simulations are built from them.
 
-`build` and `Simulation` are imported on first use, so that jax is not imported.
+`build` and `Simulation` are imported on first use, because they import jax.
 """
 
 from __future__ import annotations

@@ -210,7 +210,7 @@ def _integrator(
 
 
 def _validated(kind: type[Integrator], numbers: Mapping[str, Any], where: str) -> Mapping[str, Any]:
-    """Return an integrator's options in system-file units; those of built-in integrators are validated."""
+    """Return an integrator's options, in system-file units. Options of built-in integrators are validated."""
     if kind not in (INTEGRATORS[one] for one in INTEGRATORS.shipped):
         return numbers
     table = {key: one.item() if hasattr(one, "item") else one for key, one in numbers.items()}
@@ -219,7 +219,7 @@ def _validated(kind: type[Integrator], numbers: Mapping[str, Any], where: str) -
 
 
 def _check_instance(integrator: Integrator, units: Units, where: str) -> None:
-    """Check that a system file may contain the numbers of an integrator.
+    """Check that the numbers of an integrator are valid in a system file.
 
     Raises:
         InputError: a number is not a finite float64 scalar, or is out of range.
@@ -520,7 +520,7 @@ def with_atoms(simulation: Simulation, atoms: Atoms, skin: float) -> Simulation:
 
 
 def in_fixed_point(simulation: Simulation) -> Simulation:
-    """Return the simulation with a fixed-point state. Box edges are rounded to the spacing of positions."""
+    """Return the simulation in fixed-point numbers. Box edges are rounded to the spacing of positions."""
     masses, policy, units = simulation.masses, simulation.policy, simulation.units
     if (policy.force, policy.decision, policy.accumulate) != ("float64",) * 3:
         raise InputError(

@@ -218,7 +218,7 @@ def pair_leaves(model: CutPotential | Channels, shared: bool = True, species: bo
 
 
 def shared_radius(model: Any, name: str) -> tuple[str, ...]:
-    """Return the potential terms that share the cutoff radius at a path, if several do."""
+    """Return the potential terms that share the cutoff radius at a path. Empty for one term."""
     table, term, key = (*name.split(".", 2), "", "")[:3]
     if table != "terms" or key != "cutoff.radius":
         return ()
@@ -289,7 +289,7 @@ def _with(simulation: Simulation, name: str, new: np.ndarray) -> Simulation:
 
 
 def _heated(simulation: Simulation, new: float) -> Simulation:
-    """Set the temperature of initial velocities: draw new velocities, or scale changed ones."""
+    """Set the temperature of initial velocities. Velocities are drawn again or scaled."""
     old = simulation.draw
     heated = replace(simulation, draw=replace(old, temperature=new))
     if not (old.temperature and old.drawn) and "temperature" in simulation.integrator.numbers():
@@ -307,7 +307,7 @@ def _heated(simulation: Simulation, new: float) -> Simulation:
 
 
 class Entry(NamedTuple):
-    """Parameter of a path, index of the array entry, and unit conversion factor."""
+    """Parameter, array index and unit conversion factor that belong to a path."""
 
     whole: str  # path of the parameter
     index: tuple[int, ...] = ()  # which of its entries; empty for all of it
@@ -337,7 +337,7 @@ def entry(simulation: Simulation, name: str) -> Entry:
 
 
 def _of_pairs(simulation: Simulation) -> dict[str, Entry]:
-    """Return the paths of entries for each species or pair of species (none if there is one species)."""
+    """Return the paths of entries by species or pair of species. Empty for a single species."""
     if not simulation.pairwise or simulation.pair_types == 1:
         return {}
     single = _by_species(simulation)
@@ -353,7 +353,7 @@ def _of_pairs(simulation: Simulation) -> dict[str, Entry]:
 
 
 def resolve(simulation: Simulation, word: str, known: Sequence[str]) -> str:
-    """Find the path of a parameter from a path, an alias or an unambiguous end of a path.
+    """Return the path of a parameter, given its path, an alias or an unambiguous ending.
 
     Args:
         word: a path, an alias such as "r_cut" or "dt", or an ending that only one path has.
@@ -385,8 +385,8 @@ def resolve(simulation: Simulation, word: str, known: Sequence[str]) -> str:
 def changed(simulation: Simulation, values: Mapping[str, Any]) -> Simulation:
     """Change values of system-file keys or parameters. Return the new, validated simulation.
 
-    A simulation from a system file is rebuilt with the new values. The new simulation has no system file if a
-    changed parameter has no key there.
+    A simulation from a system file is rebuilt with the new values. If a changed parameter has no system-file
+    key, the new simulation has no system file.
 
     Example:
         >>> mdnum.changed(sim, {"cutoff.radius": 9.0, "precision.force": "float32"})

@@ -394,7 +394,7 @@ def _changed(before: Frame, after: Frame) -> float:
 
 
 def _joined(rule: Rule, parts: Sequence[_ProcessPart]) -> RuleResult:
-    """Concatenate the results of all processes, with frames counted from the first."""
+    """Concatenate the results of all processes. Frame numbers start at the first frame."""
     tables, done, last = [FlipTable.none()], 0, None
     for part in parts:
         if last is not None and part.first is not None and not last.equals(part.first):

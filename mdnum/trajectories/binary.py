@@ -102,7 +102,7 @@ class XdrFile:
         self.start(number + 1)
 
     def _stream(self, number: int, look: bool = False) -> None:
-        """Move the file position to the end of a frame. If `look` is true, verify the coordinates."""
+        """Move the file position to the end of a frame. If `look` is true, also verify the coordinates."""
         raise NotImplementedError
 
     def _read(self, count: int) -> bytes:
@@ -140,7 +140,7 @@ class XtcFile(XdrFile):
             self._starts.append(self._file.tell())
 
     def read(self, number: int) -> Any:
-        """Check a frame. Return it as decoded by MDAnalysis's library, in nm and ps."""
+        """Check a frame. Return the frame as decoded by MDAnalysis's library, in nm and ps."""
         self.check(number)
         if self._library is None:
             from MDAnalysis.lib.formats.libmdaxdr import XTCFile
@@ -190,8 +190,8 @@ def _walk(stream, atoms, whole, small):
     """Return the number of bits of all coordinates, or -8 if the stream is invalid.
 
     The full coordinates of an atom occupy `whole` bits. A flag bit follows. If the flag is set, five bits
-    follow. The five bits give how many of the next atoms are stored as differences of `small` bits, and the
-    change of `small`.
+    follow. They contain the change of `small`, and the number of next atoms that are stored as differences
+    of `small` bits.
     """
     at, done, run = 0, 0, 0
     most = 8 * stream.shape[0]

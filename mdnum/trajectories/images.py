@@ -38,10 +38,10 @@ def cell_of(frame: Frame) -> tuple[Float[np.ndarray, "3 3"], Float[np.ndarray, "
 
 
 def image_shifts(frame: Frame, pairs: Any) -> Int[np.ndarray, "pairs 3"]:
-    """Return the shift of an image of j at x[j] + shift @ box. `rank` images of j are nearer to i.
+    """Return the shift of an image of atom j. `rank` other images of j are nearer to atom i.
 
-    ASE, vesin and jax-md define shifts in the same way. Images of an atom itself have a positive first
-    nonzero component.
+    The image is at x[j] + shift @ box, as in ASE, vesin and jax-md. Images of an atom itself have a
+    positive first nonzero component.
 
     Args:
         pairs: object with arrays i, j, rank and distance, such as `Members`.

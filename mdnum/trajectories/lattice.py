@@ -377,7 +377,7 @@ def grid_for(lattice: ReducedLattice, radius: float, atoms: int, extent: Float[n
 
 @njit
 def wrap(x, lattice, bins, step):
-    """Wrap atoms. Return positions, subtracted lattice vectors, and bins."""
+    """Wrap atoms. Return the wrapped positions, subtracted lattice vectors, and bins."""
     wrapped, home, bin_of = np.empty(x.shape), np.empty(x.shape, np.int64), np.empty(x.shape[0], np.int64)
     vectors, inverse, periodic = lattice.vectors, lattice.inverse, lattice.periodic
     for i in range(x.shape[0]):
@@ -484,7 +484,7 @@ def _within(near, first, last, x0, x1, x2, largest, squares, flags, chosen):
 def meet(atoms, limits, found):
     """Record neighbor pairs. Return the numbers of decided and undecided pairs.
 
-    Within one group, half of the bins around each bin are examined. For two groups, all bins around a center
+    Within one group, half of the bins around each bin are examined. For two groups, all bins around each bin
     are examined. A pair of atoms that is found twice counts once.
     """
     written, left = 0, 0

@@ -71,7 +71,7 @@ class LibraryFrames:
         self._guard = opened(trajectory)
 
     def timestep(self, number: int, forward: bool = False) -> Any:
-        """Return MDAnalysis's timestep of a frame. `forward` means that the reader is at the previous frame.
+        """Return the Timestep of a frame. `forward` means that the reader is at the previous frame.
 
         Raises:
             UnreadableFrame: the frame is unreadable, would crash the process, or ends with a truncated
@@ -99,7 +99,7 @@ class LibraryFrames:
             return ts
 
     def frame(self, ts: Any, number: int, untimed: bool = False) -> Frame:
-        """Return a `Frame` with copies of a timestep's data. Errors are those of `timestep`."""
+        """Return a `Frame` with copies of a timestep's data. Raise the same errors as `timestep`."""
         with self._reading(number):
             time, x = float(number) if untimed else float(ts.time), np.array(ts.positions, np.float64)
             velocities = np.array(ts.velocities, np.float64) if ts.has_velocities else None
@@ -213,7 +213,7 @@ class MDAnalysisTrajectory(Trajectory):
 
 
 def labels_of(trajectory: Any) -> Callable[[int], np.ndarray | None]:
-    """Return a function that reads the atom labels of any frame. MDAnalysis reads only those of the first.
+    """Return a function that reads the labels of any frame. MDAnalysis reads only those of the first frame.
 
     The function returns None except for XYZ files and PDB files with several models.
     """
@@ -243,7 +243,7 @@ def labels_of(trajectory: Any) -> Callable[[int], np.ndarray | None]:
 
 
 def _length_of(trajectory: Any) -> str:
-    """Return the name of the length unit. "" if the file format defines no unit (GSD)."""
+    """Return the length unit of a trajectory. "" if the file format defines no unit (GSD)."""
     unit = trajectory.units.get("length")
     if unit is None or getattr(trajectory, "convert_units", True):
         return "Å" if unit else ""
@@ -252,7 +252,7 @@ def _length_of(trajectory: Any) -> str:
 
 
 def _time_factors(trajectory: Any) -> tuple[float, float]:
-    """Return two ratios of DCD time steps: stored / MDAnalysis's, and byte-swapped / stored."""
+    """Return ratios of DCD time steps: stored / MDAnalysis's value, and byte-swapped / stored value."""
     read = trajectory._file.header["delta"] if "DCD" in formats_of(trajectory) else 0.0
     if not read:
         return 1.0, math.nan
@@ -270,7 +270,7 @@ def _time_factors(trajectory: Any) -> tuple[float, float]:
 def left_over(trajectory: Any) -> str | None:
     """Describe data after the last frame that MDAnalysis reads. None if there are no data.
 
-    In line-based text, the MDAnalysis reader is moved to its last frame.
+    For text formats, this call moves the MDAnalysis reader to its last frame.
     """
     path = file_of(trajectory)
     if path is None or not path.is_file():
@@ -307,7 +307,7 @@ def left_over(trajectory: Any) -> str | None:
 
 
 def _behind_dcd(path: Path, frames: int) -> tuple[int, int]:
-    """Return (bytes after the last frame of a DCD file, bytes of a frame)."""
+    """Return the number of bytes after the last DCD frame, and of a frame."""
     from MDAnalysis.lib.formats.libdcd import DCDFile
 
     with DCDFile(str(path)) as file:
@@ -333,7 +333,7 @@ def _behind_text(file: Any) -> str | None:
 
 
 def _last_bytes(path: Path) -> tuple[bytes, int]:
-    """Return (last bytes of a file, its size). A compressed file is decompressed."""
+    """Return the last bytes and the size of a file. A compressed file is decompressed."""
     from MDAnalysis.lib.util import anyopen
 
     packed = path.suffix in (".gz", ".bz2")

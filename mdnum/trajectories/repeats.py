@@ -86,7 +86,7 @@ class RepeatedFrames:
         return digested if before == mine else known
 
     def had(self, number: int, time: float) -> bool:
-        """Return True if an earlier frame has the same time, unless all frames do."""
+        """Return True if an earlier frame has the same time. False if all times are equal."""
         of = self._times.setdefault(f"{time:.12g}", number)
         if of == number or len(self._times) < 2:
             return False
@@ -113,6 +113,6 @@ class RepeatedFrames:
         return back > 0
 
     def plain(self, most: int = 100) -> dict[str, Any]:
-        """Return the record as plain values, with up to `most` ranges per list."""
+        """Return the record as plain values, with up to `most` ranges of frames per list."""
         sizes = {"frames": self.frames, "stretches": len(self.stretches), "to_the_end": self._back > 0}
         return sizes | {"dropped": self.drop, "ranges": self.stretches[:most], "again": self.again[:most]}

@@ -5,8 +5,8 @@ This module reads three text formats itself, because other libraries lose inform
 
 - LAMMPS's `dump custom` and `dump atom`, with columns x, xu, xs or xsu (docs.lammps.org/dump.html,
   Howto_triclinic). MDAnalysis reduces the coordinates to float32 and ignores the tilt of the box.
-- GROMACS's gro files. The distance between decimal points is the column width (manual.gromacs.org, reference
-  manual, file formats). MDAnalysis and ASE read only the first gro frame.
+- GROMACS's gro files. The column width of a gro file is the distance between decimal points
+  (manual.gromacs.org, reference manual, file formats). MDAnalysis and ASE read only the first gro frame.
 - Extended XYZ, one frame at a time. By default, ASE scans the whole file first.
 """
 
@@ -402,7 +402,7 @@ def _atoms(items: dict[str, list[str]]) -> tuple[list[str], np.ndarray]:
 
 
 def _bounds(items: dict[str, list[str]]) -> Box:
-    """Return the box of a dump frame. The origin of the box is a corner."""
+    """Return the box of a dump frame. The origin is a corner of the box."""
     head, *rows = items["BOX BOUNDS"]
     names, words = head.split(), [row.split() for row in rows[:3]]
     pbc, values = np.array([name == "pp" for name in names[-3:]], bool), np.array(words, np.float64)

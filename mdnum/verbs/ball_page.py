@@ -146,7 +146,7 @@ def _nearest(view: BallView) -> Iterator[Plot]:
 
 
 def _ranges(view: BallView) -> Iterator[Any]:
-    """Yield a table: range of each quantity, and the first step outside the range of narrower formats."""
+    """Yield a table: each quantity's range, and the first step outside the range of narrower formats."""
     table = range_table(lambda name: TEXTS(f"range_{name}"), view.table("steps"))
     if table.rows:
         yield table

@@ -240,7 +240,7 @@ def _demos(view: View) -> Sequence[Mapping[str, Any]]:
 
 
 def _heading(demo: Mapping[str, Any], demos: Sequence[Any]) -> str:
-    """Return a section's heading: the demonstration's title if the page has several demonstrations."""
+    """Return the heading of a section. With several demonstrations, it is the demonstration's title."""
     return demo["title"] if len(demos) > 1 else TEXTS("detail")
 
 

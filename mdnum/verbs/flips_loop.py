@@ -19,7 +19,7 @@ _POINTS = 2_000
 
 
 def loop_told(folder: RunFolder) -> dict[str, Any]:
-    """Return statistics of neighbor lists and energy. None if not recorded."""
+    """Return statistics of the neighbor lists and energies of a recorded loop. None if not recorded."""
     loop = folder.read("loop")
     return {"lists": _lists_told(loop, folder), "energy": _energy_told(loop, folder)}
 
@@ -111,7 +111,7 @@ def sections(view: FlipsView) -> Iterator[Section]:
 
 
 def unfinished(view: FlipsView) -> Verdict:
-    """Return the verdict on a loop that ended with an open recorder."""
+    """Return the verdict on a loop that ended without closing its recorder."""
     frames, one = view.table("frames"), view.summary["rules"][0]
     number, entered, left = (frames[name][frames["rule"] == 0] for name in ("number", "entered", "left"))
     flips, last = int((entered + left).sum()), int(number[-1])

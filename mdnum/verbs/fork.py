@@ -140,7 +140,7 @@ def fork_screen(
     workers: int | None = None,
     **keep: Unpack[Keep],
 ) -> Outcome:
-    """Run a system once per numerical choice. Rank the choices by the first different decision.
+    """Run a system once per numerical choice. Rank the choices by the step of the first different decision.
 
     For one choice, `fork` also tests whether a flip is the cause.
 
@@ -326,7 +326,7 @@ def page_screen(view: View, verdict: Verdict) -> Page:
 
 
 def _ranking(rows: Any, steps: int, figure: Canvas) -> None:
-    """Draw when decisions first differ and runs split, for each numerical choice."""
+    """For each numerical choice, draw when decisions first differ and when runs split."""
     axes = figure.subplots()
     place = np.arange(len(rows))[::-1]
     for name, label, marker, color, filled in (

@@ -1,4 +1,4 @@
-"""The commands `mdnum fork certify` (exact arithmetic) and `mdnum fork processes`."""
+"""`mdnum fork certify`: comparison with exact arithmetic. `mdnum fork processes`: program variants."""
 
 from __future__ import annotations
 
@@ -266,7 +266,7 @@ def fork_processes(
     which: Sequence[Variant] | None = None,
     **keep: Unpack[Keep],
 ) -> Outcome:
-    """Run a system in several ways (jit, eager, batched, differentiated, XLA flags). Compare results.
+    """Run a system in several ways (jit, eager, batched, differentiated, or with XLA flags). Compare results.
 
     Example:
         >>> mdnum.fork_processes("argon/crystal-108", steps=100)

@@ -444,7 +444,7 @@ def _nearest(run: RunView) -> Iterator[Any]:
 
 
 def _ranges(run: RunView) -> Iterator[Any]:
-    """Yield a table of the range of each quantity, and the first step outside narrower formats."""
+    """Yield a table: each quantity's range, and the first step outside the range of narrower formats."""
     examined, series, units = run.table("ranges"), run.series, vars(run.units)
     sums = columns({name: series[name][:, None] for name in ("potential", "kinetic")})
     sums["step"] = series["step"]

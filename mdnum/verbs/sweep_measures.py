@@ -52,7 +52,7 @@ def split(run: Sample, argument: str) -> Value:
 
 
 def separation(run: Sample, argument: str) -> Value:
-    """Exponential growth rate of the distance between two runs, in 1/time, from a fit."""
+    """Fitted exponential growth rate (1/time) of the distance between two runs."""
     found = _pair(run, argument)
     grown = found.growth["B"]
     if not grown.plain:
@@ -61,7 +61,7 @@ def separation(run: Sample, argument: str) -> Value:
 
 
 def _asked(simulation: Any, steps: int, argument: str) -> tuple[Any, str]:
-    """Return loss and full parameter name of a text LOSS/PARAMETER."""
+    """Return the loss and the full parameter name that a text LOSS/PARAMETER means."""
     from mdnum.gradients import parameters
     from mdnum.gradients.losses import parse
 
@@ -76,7 +76,7 @@ def _asked(simulation: Any, steps: int, argument: str) -> tuple[Any, str]:
 
 
 def _diagnosis(run: Sample, argument: str) -> tuple[Any, str]:
-    """Return gradient and trust horizon, as in `mdnum grad`, and the full parameter name."""
+    """Return the diagnosis of `mdnum grad` (gradient and trust horizon), and the full parameter name."""
     from mdnum.gradients import Problem
     from mdnum.gradients.diagnose import diagnose
 

@@ -474,7 +474,7 @@ def _missed(
 
 
 def _shares(term: Float[np.ndarray, "terms columns"], size: Float[np.ndarray, "columns"]):
-    """Return relative contributions, and the root of their cumulative sum of squares."""
+    """Divide contributions by `size`. Return them, and the root of their cumulative sum of squares."""
     with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
         # a term that is not known weighs
         share = np.where(term == 0, 0.0, np.nan_to_num(np.abs(term) / size, nan=np.inf))
@@ -527,7 +527,7 @@ def standard_error(made: Sequence[Horizons]) -> dict[str, Float[np.ndarray, "poi
 def last_below(
     at: Int[np.ndarray, "points"], values: dict[str, Float[np.ndarray, "points"]], limit: float
 ) -> tuple[int, bool]:
-    """Return the last horizon before two successive errors above a limit, and whether there are any.
+    """Return the last horizon before two successive errors above a limit, and whether such errors exist.
 
     Relative errors are large where a gradient changes sign. A single error is therefore ignored, except at
     the last horizon.

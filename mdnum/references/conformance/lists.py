@@ -19,7 +19,7 @@ from mdnum.registry import Registry
 
 
 class KeptList(Protocol):
-    """A neighbor list that is built and then updated. `answer.read` describes the pairs.
+    """A neighbor list that is built and then updated. `answer.read` describes the accepted forms of pairs.
 
     `allocate` builds a new neighbor list, and may be called again. `update` receives the current positions.
     The pairs must include every pair within r_cut at the current positions. Further pairs may be farther
@@ -72,7 +72,7 @@ class ListLimits:
         return next((why for beyond, why in self._beyond(case) if beyond), None)
 
     def _beyond(self, case: Case) -> Iterator[tuple[bool, str]]:
-        """Yield for each limit whether a test case exceeds it, and its name."""
+        """For each limit, yield whether a test case exceeds the limit, and its name."""
         pbc, cells = np.array(case.pbc), [still.cell for still in case.stills]
         least = min(len(still.positions) for still in case.stills)
         yield least < self.atoms, f"at least {self.atoms} atom{'s' * (self.atoms > 1)}"

@@ -308,7 +308,7 @@ def _images(cell: ndarray, pbc: Pbc, r_cut: float) -> int:
 def _positions(
     place: str, count: int, cell: ndarray, pbc: ndarray, r_cut: float, rng: np.random.Generator
 ) -> tuple[ndarray, float]:
-    """Return positions and a cutoff. For "at the cutoff", the cutoff equals a pair distance."""
+    """Return positions and a cutoff. If `place` is "at the cutoff", the cutoff equals a pair distance."""
     full = completed(cell, pbc)
     # free axes have vectors of length 1, which would be no room
     room = np.where(pbc, 1.0, np.maximum(1.0, 3.0 * r_cut / np.linalg.norm(full, axis=1)))
@@ -425,7 +425,7 @@ def drawn(count: int, seed: int) -> list[Case]:
 
 
 def alike(case: Case) -> Iterator[tuple[str, bool, Case]]:
-    """Yield (description, whether neighbors stay the same, variant) of a test case."""
+    """Yield variants of a test case: (description, whether neighbors stay the same, variant)."""
     yield "when it is asked anew", True, case
     if case.atoms > 1:
         yield "with its atoms in reverse order", True, case.only(np.arange(case.atoms)[::-1])

@@ -100,7 +100,7 @@ def _numbers(failed: Failed, how: Conventions, reach: float) -> str:
 
 
 def _calls(case: Case) -> Iterator[tuple[Still, bool, float]]:
-    """Yield positions and cell of each call, whether a new list is built, and the skin."""
+    """For each call, yield the positions and cell, whether a list is built, and the skin."""
     atoms = None
     for still in case.stills:
         count = len(still.positions)
@@ -118,7 +118,7 @@ _SECONDS = 60.0  # seconds that a script may take
 
 
 def reproduces(report: Report, failed: Failed, deadline: Deadline) -> bool | None:
-    """Run the script of a failure. Return whether the failure appears, or None after a time limit."""
+    """Run the script of a failure. Return whether the failure appears. None without a result."""
     tested, code, text = report.tested, failed.code, failed.worst.text
     if not tested.source.strip() or deadline.passed:
         return None
