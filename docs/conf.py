@@ -33,6 +33,8 @@ nb_execution_timeout = 600
 nb_execution_raise_on_error = True
 nb_merge_streams = True
 
+# blocks without a language are output of commands
+highlight_language = "text"
 html_theme = "pydata_sphinx_theme"
 html_title = f"mdnum {version}"
 html_static_path = ["_static"]
