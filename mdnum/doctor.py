@@ -1,7 +1,7 @@
 """`mdnum doctor`: tests of whether this installation computes correct numbers.
 
 All tests of `mdnum doctor` are computations on the current machine. Package versions with known faults are
-also reported. No version is assumed correct.
+also reported. No package version is assumed to be correct.
 
 Error bounds in mdnum assume that +, -, *, / and sqrt are correctly rounded. Sums must not be reordered. On
 CPUs, XLA rounds correctly and does not reorder sums. XLA does contract a*b+c and rewrite divisions by

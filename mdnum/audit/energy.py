@@ -51,7 +51,7 @@ class NveRun:
 
     @property
     def total(self) -> Float[np.ndarray, "steps"]:
-        """Total energy at every time step, eV."""
+        """Total energy (eV) at every time step."""
         return self.potential + self.kinetic
 
     @property
@@ -139,7 +139,7 @@ def _root(start: Float[np.ndarray, "3"], way: Float[np.ndarray, "3"], square: fl
 
 
 def along_step(subject: CalculatorSubject, run: NveRun, step: int, ends: bool = False) -> Curve:
-    """Energy and force on the line between two steps. If `ends` is true, the ends have the run's values."""
+    """Energy and force on the line between two steps. If `ends` is true, values at the ends are the run's."""
     way = run.positions[step] - run.positions[step - 1]
 
     def at_share(share: float) -> tuple[float, float]:
@@ -155,7 +155,7 @@ def along_step(subject: CalculatorSubject, run: NveRun, step: int, ends: bool = 
 def account(
     subject: CalculatorSubject, run: NveRun, step: int, crossed: Sequence[RunCrossing], smooth: int = 2
 ) -> tuple[list[float], float]:
-    """Compute the work of the forces between two time steps, in pieces between crossings.
+    """Compute the work of the forces between two time steps, separately between crossings.
 
     Args:
         subject: a calculator object separate from the run's; called three times per crossing, plus once.
@@ -223,11 +223,11 @@ class HiddenJumps:
         return max(1.0 - left / whole, 0.0) if whole else 0.0
 
     def brought(self, step: int) -> float:
-        """Return the sum of the energy jumps found in a time step, eV."""
+        """Return the sum (eV) of the energy jumps found in a time step."""
         return sum(jump.energy for jump in self.jumps if jump.step == step)
 
     def energies(self, rest: Steps) -> Steps:
-        """Energy change (eV) of each step due to hidden jumps. Estimated for steps not searched."""
+        """Energy change (eV) of each step due to hidden jumps. Steps not searched have estimates."""
         found = np.zeros(len(rest))
         for step in self.candidates:
             found[step] = self.brought(step) if step in self.steps else self.share * rest[step]
@@ -314,12 +314,12 @@ class EnergyBalance:
 
     @property
     def elsewhere(self) -> Steps:
-        """Energy change of each step due to jumps not at distance thresholds, eV."""
+        """Energy change (eV) of each step due to jumps away from distance thresholds."""
         return self.hidden.energies(self.rest)
 
     @property
     def filled(self) -> Steps:
-        """Unexplained energy change of each step without jumps, eV. Unmeasured steps get the mean change."""
+        """Unexplained energy change (eV) of each step without jumps. Unmeasured steps get the mean change."""
         left = self.rest - self.elsewhere
         return np.where(np.isnan(left), np.nanmean(left), left)
 

@@ -183,7 +183,7 @@ def nearest_distance(atoms: Atoms) -> float:
 
 
 def trio(symbol: str, side: float, way: float) -> Atoms:
-    """Return an atom at the origin, and two companions behind it."""
+    """Return an atom at the origin, with two companion atoms behind it."""
     depth = way * side * np.sqrt(0.75)
     return Atoms([symbol] * 3, [(0, 0, 0), (depth, side / 2, 0), (depth, -side / 2, 0)])
 

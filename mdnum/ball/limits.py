@@ -24,7 +24,7 @@ def largest(name: str) -> float:
 
 
 def spacing(value: float, name: str) -> float:
-    """Return the distance from a number to the next number of a format."""
+    """Return the distance from a number to the next larger number of a floating-point format."""
     limits = ml_dtypes.finfo(DTYPES[name])
     exponent = int(np.floor(np.log2(max(abs(value), float(limits.smallest_normal)))))
     return float(limits.eps) * 2.0**exponent

@@ -1,6 +1,6 @@
 """Repeated runs around a fork: nearby atoms, imposed decisions and minimal causes.
 
-Decisions of run A can be imposed on run B. Run B makes all other decisions itself. The tool Verrou searches
+Decisions of run A can be imposed on run B. All other decisions are those of run B. The tool Verrou searches
 in a similar way for instructions that cause an error.
 """
 

@@ -307,7 +307,7 @@ def transformed(x, by):
 
 
 def strain_loss(reference: Cell, now: Cell, r_list):
-    """Return an upper bound on how much a deformation of the box shortens a distance of r_list.
+    """Return an upper bound on how much a deformation of the box shortens a distance of length r_list.
 
     A vector of length r_list has at least the length sigma_min(F) * r_list after the deformation F. A
     neighbor list is complete while `strain_loss` plus twice the largest displacement (relative to the box) is

@@ -17,7 +17,7 @@ def power(exponent: int) -> str:
 
 
 def number(value: float | None, digits: int = 3, signed: bool = False, whole: bool = True) -> str:
-    """Format a number with significant digits. Numbers far from 1 have powers of ten. None is "–".
+    """Format a number with significant digits. Numbers far from 1 are shown with powers of ten. None is "–".
 
     Args:
         whole: True to write numbers up to a million in full, even with digits beyond the significant ones.

@@ -38,7 +38,7 @@ class Back(NamedTuple):
 
 
 class Stretched(NamedTuple):
-    """Steps of a reversed run, earliest first, in the order of the neighbor list."""
+    """Steps of a reversed run, earliest first. Atoms are in the order of the neighbor list."""
 
     first: int  # step of the first row
     rows: int  # how many there are; the record's other rows are void

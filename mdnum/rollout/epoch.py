@@ -127,7 +127,7 @@ class StepInputs(NamedTuple):
 
 
 class EpochRecord(NamedTuple):
-    """Record with one row per time step, in the order of the neighbor list."""
+    """Record with one row per time step. Atoms are in the order of the neighbor list."""
 
     # x, v: positions and full-step velocities, shape (rows, 3, atoms), or (rows, 3, 0) without rows
     x: Float[Array, "rows 3 atoms"]

@@ -181,7 +181,7 @@ class MdProgram:
         return Number(name, here, unit, at, parameters.is_positive(simulation, name))
 
     def history(self, steps: int, loss: Loss | None = None) -> DecisionHistory:
-        """Return all decisions of a run and its loss."""
+        """Return the loss and all decisions of a run."""
         marks: list[np.uint64] = []
         segment = None
         for segment in Engine(self.simulation, steps, start=self.begin).segments():

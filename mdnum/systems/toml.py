@@ -2,7 +2,7 @@
 
 The standard library only reads TOML, without line numbers. This module also writes TOML and finds the line of
 a key. If the keys depend on `kind` or `rule`, a table is a union of pydantic models; `models` selects one. An
-error message has the value, the expected value and the line of the file.
+error message states the value, the expected value and the line of the file.
 """
 
 from __future__ import annotations
@@ -274,7 +274,7 @@ def unusable(key: str, message: str, remedy: str) -> PydanticCustomError:
 
 
 def models(root: type[TomlTable], key: Key, data: Mapping[str, Any]) -> list[type[TomlTable]]:
-    """Return the pydantic models for the table at a key, best first. Empty if there is no table."""
+    """Return the pydantic models for the table at a key, best match first. Empty if there is no table."""
     found, table = [root], data
     for part in key:
         table = table.get(part, {}) if isinstance(table, Mapping) else {}

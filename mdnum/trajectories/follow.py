@@ -172,9 +172,9 @@ def follow(
 ) -> Iterator[Pass]:  # fmt: skip
     """Read each frame once. Pass rows of the tables "members", "flips", "frames" and "motion" to `sink`.
 
-    If `residues` is given, pairs of residues are examined. `groups` still contains atoms. The same `Pass` is
-    yielded after each frame. Iteration may stop at any frame. Memory use does not grow with the number of
-    frames. Reading ends at the first unreadable or unusable frame. Earlier results are kept.
+    If `residues` is given, pairs of residues are examined. Even then, `groups` contains atoms. The same
+    `Pass` is yielded after each frame. Iteration may stop at any frame. Memory use does not grow with the
+    number of frames. Reading ends at the first unreadable or unusable frame. Earlier results are kept.
 
     Raises:
         InputError: the first frame cannot be read or used, so there are no results to keep.
@@ -544,7 +544,7 @@ def _sets_at(
 
 
 def growth_of(frames: int, one: NeighborSets, table: Mapping[str, np.ndarray]) -> dict[str, Any]:
-    """Return growth rates of the distance between two runs, before and after neighbor sets differ."""
+    """Return growth rates of the distance between two runs, before and after neighbor sets first differ."""
     cutoff, furthest = isinstance(one.rule, CutoffRule), float(table["furthest"].max(initial=0.0))
     limit = 0.1 * (one.rule.reach if cutoff else furthest)
     cut = frames if one.first is None else one.first["frame"]

@@ -1,11 +1,11 @@
 """Resolution of the positions in a file, and its effect on pair decisions.
 
-A file with three decimals changes every coordinate by up to 0.0005. Rounding can change the decision whether
+Rounding to three decimals changes every coordinate by up to 0.0005. Rounding can change the decision whether
 a pair near the cutoff is inside. `infer` finds the decimal grid from the coordinates.
 
-Rounding can move a cutoff crossing to another frame, hide a short contact, or create a crossing. One file
-does not show which flips rounding changes. `grid_effect` estimates the number of these flips. Random pairs
-near the cutoff are moved by displacements found in the file. Flips are then counted with and without
+Rounding can move a cutoff crossing to another frame, hide a short contact, or create a crossing. A rounded
+file does not show which flips rounding changed. `grid_effect` estimates the number of these flips. Random
+pairs near the cutoff are moved by displacements found in the file. Flips are then counted with and without
 rounding. In a nearest-neighbor rule, a flip exchanges two neighbors at similar distances. For
 nearest-neighbor rules, random triples of atoms are moved.
 """
@@ -339,7 +339,7 @@ def _drawn(
 
 
 def _steps(resolution: Resolution, frame: Frame) -> Float[np.ndarray, "3 3"]:
-    """Return the grid vectors of rounded positions, as rows, in length units."""
+    """Return the grid vectors (rows, in length units) of rounded positions."""
     if resolution.kind == "fractions" and not resolution.digits:
         return resolution.step * frame.box.matrix
     return resolution.usual_step(frame) * np.eye(3)

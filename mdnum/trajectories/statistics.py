@@ -142,8 +142,8 @@ def residence(found: Durations, pairs: Int[np.ndarray, "frames"]) -> Float[np.nd
 def again(stays: Contacts, lags: Int[np.ndarray, "lags"], frames: int) -> tuple[np.ndarray, np.ndarray]:
     """Count pairs that are in contact at a frame and at a later frame.
 
-    The first array divided by the second is the residence with interruptions. Counts for disjoint subsets of
-    the pairs can be added. Lags are between 0 and frames - 1.
+    The first array divided by the second is the residence with interruptions. Counts for disjoint sets of
+    pairs can be added. Lags are between 0 and frames - 1.
 
     Returns:
         two arrays by lag, summed over frames: numbers of pairs inside at both frames, and at the first frame.

@@ -1,4 +1,4 @@
-"""Compare forces with finite differences of the energy. The step length suits the calculator's noise."""
+"""Compare forces with finite differences of the energy. The finite-difference step depends on the noise."""
 
 from __future__ import annotations
 
@@ -67,7 +67,7 @@ class Slope:
 
     @property
     def gap(self) -> float:
-        """Absolute difference between the finite difference of the energy and the force, eV/Å."""
+        """Absolute difference (eV/Å) between the finite difference of the energy and the force."""
         return abs(self.difference - self.force)
 
     @property

@@ -87,7 +87,7 @@ def _check_place(system: BallSystem, step: int | None, ball: int | None) -> None
 
 @choice("contact")
 class ContactStep(Choice):
-    """One contact decision of one ball inverted."""
+    """One inverted contact decision of one ball."""
 
     worlds = ("ball",)
     screened = "contact=earlier contact=later"

@@ -92,7 +92,7 @@ class Relabel(Summed):
 
 @choice("rotate")
 class Rotate(Summed):
-    """The axes of the box exchanged or reversed.
+    """Exchanged or reversed axes of the box.
 
     An exchange of axes is exact. The exchange changes the order of the sum of a squared distance. If an axis
     is reversed, wrapping positions into the box needs one more rounding.

@@ -81,7 +81,7 @@ class Turns:
 
     @property
     def reach(self) -> Float[np.ndarray, "turns"]:
-        """Uncertainty of the distance at each turning point, from other runs."""
+        """Uncertainty of the pair distance at each turning point, from a run with shorter time steps."""
         if not len(self):
             return np.zeros(0)
         shift = self.table["shift"]

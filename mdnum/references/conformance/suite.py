@@ -357,7 +357,7 @@ def examine(
 
 
 def _keeps_order(examiner: Examiner) -> bool | None:
-    """Return whether three identical calls return the same pairs in order. None if a call fails."""
+    """Return whether three identical calls return the same pairs in the same order. None if a call fails."""
     for case in (once("order", "reuse", gas(40, 6.0, 120), 6.0), once("order", "reuse", gas(40, 3.0, 120))):
         case = replace(case, skin=0.3 if examiner.tested.kept else 0.0)
         if examiner.tested.limits.refusal(case) is None:
