@@ -49,7 +49,7 @@ class RepeatCounts:
 
 
 class Repeats:
-    """Energies and forces by structure (as a hash), to compare repeated evaluations.
+    """Energies and forces of evaluated structures, to compare repeated evaluations.
 
     Attributes:
         new: statistics of the first results of new calculator objects, which remember no other structure.
@@ -91,7 +91,7 @@ def no_rounding(change: float, force: float, answer: EnergyForces, kT: float) ->
 
 
 def differences(one: EnergyForces, other: EnergyForces) -> tuple[float, float]:
-    """Return the difference of the energies, and the largest of the force components. 0 if no forces."""
+    """Return the difference of two energies, and the largest difference of force components (0 if none)."""
     forces = None if one[1] is None or other[1] is None else other[1] - one[1]
     return abs(other[0] - one[0]), 0.0 if forces is None else largest(forces)
 

@@ -1,7 +1,7 @@
 """Search for discontinuities of the energy of many atoms.
 
-In a many-body potential, the interaction of a pair depends on other atoms. The energy may jump at a threshold
-where two isolated atoms have a smooth energy. Therefore, atoms and triples of atoms are moved through all
+In a many-body potential, the interaction of a pair depends on other atoms. The energy may jump at a distance
+at which two isolated atoms have a smooth energy. Therefore, atoms and triples of atoms are moved through all
 pair thresholds and other distances. To detect a limit on the number of neighbors, an atom is moved past the
 neighbors of a crowded atom. If only k neighbors are kept, the energy or a force jumps when the moving atom
 replaces the k-th neighbor. If only the first k neighbors of the list are kept, reordering the atoms reveals
@@ -382,7 +382,7 @@ def cluster(pair: Pair, radius: float, count: int) -> tuple[Atoms, Float[np.ndar
     """Return a central atom at the origin, `count` neighbors, and their distances.
 
     The neighbors are evenly spread in angle (golden spiral) and in volume. Random positions would put some
-    neighbors too close together. The central atom is first. The neighbors follow in order of distance.
+    neighbors too close together. The central atom is first. The neighbors are sorted by distance.
     """
     k = np.arange(count)
     share = (k + 0.5) / count

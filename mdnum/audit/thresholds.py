@@ -127,7 +127,7 @@ def find_thresholds(subject: CalculatorSubject) -> list[PairThreshold]:
 
 
 def walk_pairs(subject: CalculatorSubject, progress: Progress = idle) -> PairWalks:
-    """Scan every pair of species over a range of distances, only once."""
+    """Scan every pair of species once over a range of distances."""
     if "walks" not in subject.known:
         with subject.meter.apart(WALKING_CALLS):
             subject.known["walks"] = _walked(subject, progress)
@@ -247,7 +247,7 @@ def _seen(
     rounding: float,
     known: Sequence[float],
 ) -> tuple[float, float, float, float] | None:
-    """Return the range of distances, and median and maximum of the smallest detectable force jumps.
+    """Return the range of scanned distances, and median and maximum of detection limits for force jumps.
 
     Distances beyond the end of the interaction are omitted. Distances close to a known threshold are also
     omitted. A second threshold would be hidden there.

@@ -250,7 +250,7 @@ def of_energy(
 def _along(
     met: Met, vectors: Float[Array, "3 atoms"], matrix: Float[Array, "3 3"] | None = None
 ) -> Float[Array, "most"]:
-    """Return the difference between both atoms' vectors along each pair.
+    """Return the difference between the vectors of the two atoms, projected on each pair's direction.
     If `matrix` contains lattice vectors, the nearest image of the second atom is used.
     """
     dtype = vectors.dtype

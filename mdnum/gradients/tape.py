@@ -119,7 +119,7 @@ def stretch_of(segment: Segment, start: Start, ledger: FlipTable | None = None) 
 
 
 class Pace(NamedTuple):
-    """Number of steps between the frames that a loss uses, and its first step."""
+    """Number of steps between the frames that a loss uses, and the step of the first frame."""
 
     between: Int[Array, ""]  # steps from one frame to the next; 0 where they are not a series at equal times
     first: Int[Array, ""]  # step of the first frame
@@ -300,7 +300,7 @@ class ReversibleTape(RunTape):
 
     @property
     def nbytes(self) -> int:
-        """Memory (bytes) of bits that friction discarded. The memory grows with each step."""
+        """Memory (bytes) that stores the bits discarded by friction. The memory grows with each step."""
         return sum(bath.nbytes for bath in self.baths.values())
 
     def forward(self) -> Iterator[TapeStretch]:

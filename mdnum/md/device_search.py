@@ -1,8 +1,8 @@
-"""Neighbor search in XLA. The lists stay on the device of the positions.
+"""Neighbor search in XLA. Neighbor lists stay on the device of the positions.
 
 Atoms are compared in the same order as in `md.host_search`. Device and host therefore build the same neighbor
-table from the same bins. A search copies two numbers to the host: the largest numbers of atoms in a bin and
-of neighbors. Extents of the atoms along nonperiodic axes are also copied to the host.
+table from the same bins. A search copies two numbers to the host: the largest number of atoms in a bin, and
+the largest number of neighbors. Extents of the atoms along nonperiodic axes are also copied to the host.
 """
 
 from __future__ import annotations

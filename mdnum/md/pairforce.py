@@ -202,7 +202,7 @@ class PairForce(eqx.Module):
         return terms
 
     def weights(self, tables: Tables) -> list[Float[Array, "atoms"]]:
-        """Weights of the atoms for all weighted terms, in table order."""
+        """Weights of the atoms for all weighted terms, in the neighbor table's order of atoms."""
         return [one[tables.order] for one in self.model.weights if one is not None]
 
     def in_blocks(
@@ -301,7 +301,7 @@ def _joined(parts: Sequence[Any]) -> Decisions:
 
 
 def factors(model: CutPotential, products: Iterable[Any]) -> list[tuple[Any, ...]]:
-    """Return weight factors of the term energies. Empty if no term has weights.
+    """Return the weight factors of pairs for each potential term. Empty if no term has weights.
 
     Args:
         products: products of the weights of both atoms, for terms with weights.
@@ -539,7 +539,7 @@ class ManyBodyForce(eqx.Module):
 
 
 class MdState(NamedTuple):
-    """State of a simulation between two force evaluations, in table order."""
+    """State of a simulation between two force evaluations, in the neighbor table's order of atoms."""
 
     step: Int[Array, ""]  # the step whose forces come next
     x: Float[Array, "3 atoms"]  # wrapped positions at that step, shape (3, atoms)

@@ -49,7 +49,7 @@ _LOOK = 5.0
 def _pinned(width: int) -> None:
     """Restrict this process to reserved cores. XLA uses all visible cores despite OMP_NUM_THREADS.
 
-    A file lock reserves a core. The lock is released when the process ends. Sweeps on the same machine
+    A file lock reserves a core. The file lock is released when the process ends. Sweeps on the same machine
     therefore use different cores. If no core is free, two processes use the same core.
     """
     with suppress(ImportError, AttributeError, OSError):

@@ -269,7 +269,7 @@ class GradientTable(TomlTable):
 
 
 def _changes(value: Any) -> Any:
-    """Convert nested TOML tables of changed keys to flat tables with dotted keys."""
+    """Convert nested TOML tables of changed values to flat tables with dotted keys."""
     if not isinstance(value, Mapping):
         return value
     return {name: flat(table) if isinstance(table, Mapping) else table for name, table in value.items()}

@@ -271,7 +271,7 @@ def _check_width(cell: Cell, r_cut: float, skin: float, length: str) -> None:
 
 
 def repeats(cell: Cell, r_list: float) -> str:
-    """Return how often the box is repeated along a, b and c for the minimum image."""
+    """Return how often the box must be repeated along a, b and c for the minimum-image convention."""
     return " x ".join(str(max(1, math.ceil(2 * r_list / width))) for width in cell.widths)
 
 

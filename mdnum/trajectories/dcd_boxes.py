@@ -33,7 +33,7 @@ Examined = list[tuple[int, np.ndarray, np.ndarray]]
 
 
 def conventions(cell: Float[np.ndarray, "6"]) -> dict[str, Float[np.ndarray, "3 3"]]:
-    """Return the lattice vectors by each valid convention. MDAnalysis's convention is first."""
+    """Return the lattice vectors by each valid convention. The first convention is that of MDAnalysis."""
     from MDAnalysis.lib.mdamath import triclinic_vectors
 
     angles, found = cell[[4, 3, 1]], {}

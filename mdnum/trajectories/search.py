@@ -188,7 +188,7 @@ def _memory() -> float:
 
 
 def rows_of(found: Found, atoms: int) -> NeighborRows:
-    """Sort pairs into one row per atom. In undirected pairs, the lower index is first."""
+    """Sort pairs into one row per atom. Undirected pairs have the lower index first."""
     i, j, directed = found.i, found.j, found.kind == DIRECTED
     low, high = (i, j) if directed else (np.minimum(i, j), np.maximum(i, j))
     room = np.empty((4, len(i)), np.int64)

@@ -170,7 +170,7 @@ class Trajectory(ABC):
 
     @abstractmethod
     def raw_frames(self) -> AbstractContextManager[Callable[[int], Any]]:
-        """Open the file and provide a function that returns raw frames, then None."""
+        """Open the file and provide a function that returns raw frames, and None after the last."""
 
     @abstractmethod
     def decoded(self, number: int, raw: Any) -> Frame:

@@ -121,7 +121,7 @@ def _aged(subject: CalculatorSubject, ran: NveRun, count: int, noise: NoiseFloor
 
 
 def _brief(ran: NveRun, stale: tuple[float, float], units: Units) -> CheckResult:
-    """Return whether energies depend on earlier steps, from a short run."""
+    """Use a short run to find whether energies depend on earlier steps."""
     (differs, allowed), steps = stale, len(ran.potential) - 1
     change = 1e3 * largest(ran.total - ran.total[0]) / ran.positions.shape[1]
     seen = Measured(differs, "energy", allowed)

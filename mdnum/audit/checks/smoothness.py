@@ -371,7 +371,7 @@ def _charts(walks: PairWalks, subject: CalculatorSubject) -> list[Chart]:
 
 
 def _energies(walk: PairWalk, kT: float) -> Chart:
-    """Chart of the pair energy. The energy range shows the jumps at thresholds."""
+    """Chart of the pair energy. Large energies are omitted, so that jumps at thresholds are visible."""
     depth = max(-float(walk.energy.min()), 2 * kT)
     shown = walk.energy < 2 * depth
     first = len(shown) - int(np.argmin(shown[::-1])) if not shown.all() else 0

@@ -34,8 +34,8 @@ class Choice:
     To add a choice, decorate a subclass with `choice("family")`. The family is the word before "=" in the
     choice's text. A choice in another package sets its own `family` and is decorated with `choice(None)`. The
     choice is an entry point of the group "mdnum.choices". The fields of a choice are written after "=",
-    separated by ":". A field `both` is written after "@". The first line of the class docstring describes the
-    choice for users.
+    separated by ":". The field `both` is written after "@". The first line of the class docstring describes
+    the choice for users.
     """
 
     family: ClassVar[str] = ""  # the word before "="

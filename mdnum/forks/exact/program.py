@@ -278,7 +278,7 @@ class ExactProgram:
 
 
 class _Run:
-    """One attempt to prove all decisions of a run with some number of bits."""
+    """One attempt to prove all decisions of a run with a given number of bits."""
 
     def __init__(self, program: ExactProgram, steps: int, bits: int):
         self.program, self.steps, self.bits, self.step = program, steps, bits, 0
@@ -399,7 +399,7 @@ class _Run:
     def _decide(
         self, x, centers: Float[np.ndarray, "atoms 3"], radius: float, thresholds: list
     ) -> tuple[Bool[np.ndarray, "all_pairs"], Int[np.ndarray, "all_pairs 3"], Float[np.ndarray, "all_pairs"]]:
-        """Make all decisions of a step by double-precision bounds, or else by intervals.
+        """Make all decisions of a step by double-precision bounds or, if necessary, by intervals.
 
         Double precision and exact arithmetic may choose different nearest images. Half the box exceeds r_cut
         by more than the rounding errors. Different nearest images are then both outside the cutoff.
