@@ -234,7 +234,7 @@ def order_change(
 
 
 def measured(subject: CalculatorSubject, atoms: Atoms, rng: np.random.Generator) -> NoiseFloor:
-    """Return the larger noise of two tests: a line of structures, and reordered atoms."""
+    """Return the larger noise from two tests: structures along a line, and reordered atoms."""
     noise = along_a_line(subject, atoms, rng)
     return noise.louder(order_change(subject, atoms, noise, rng)[1])
 
@@ -242,7 +242,7 @@ def measured(subject: CalculatorSubject, atoms: Atoms, rng: np.random.Generator)
 def in_order(
     subject: CalculatorSubject, atoms: Atoms, order: Int[np.ndarray, "atoms"]
 ) -> tuple[float, Forces]:
-    """Compute energy and forces for reordered atoms. The forces have the original order."""
+    """Compute energy and forces of reordered atoms. Forces are returned in the original order."""
     there = atoms[order]
     assert isinstance(there, Atoms)
     energy, forces = subject.both(there)
@@ -362,7 +362,7 @@ class Digits:
         return 0.0 if self.decimals is None else 10.0**-self.decimals
 
     def grain(self, values: np.ndarray) -> float:
-        """Return the spacing of the rounded numbers at the largest absolute value."""
+        """Return the spacing of rounded numbers near the largest absolute value of `values`."""
         return max(self.quantum, 2.0**-self.bits * largest(values))
 
     @property
@@ -388,8 +388,8 @@ def digits(values: np.ndarray) -> Digits:
 def precision(subject: CalculatorSubject, atoms: Atoms, noise: NoiseFloor) -> Iterator[Observed]:
     """Yield a finding if energies or forces have fewer digits than a double.
 
-    Discrete steps are measured along a line of structures, because digits may not show them. For example,
-    forces rounded before a unit conversion use all digits.
+    Discrete steps are also measured along a line of structures, because digits may not reveal them. For
+    example, forces rounded before a unit conversion use all digits.
     """
     stairs = steps(subject, atoms)
     size, typical = largest(stairs.energies), rms(stairs.forces)

@@ -319,7 +319,7 @@ def _apart(one: BallRun, other: BallRun, last: int) -> Float[np.ndarray, "times"
 
 
 def _ends(a: BallRun, b: BallRun) -> tuple[int, dict[str, str]]:
-    """Return the last step with finite states, and how each run ends."""
+    """Return the last step at which both states are finite, and how each run ends."""
     ends = {}
     for name, run in (("A", a), ("B", b)):
         finite = np.isfinite(run.y.astype(np.float64)) & np.isfinite(run.v.astype(np.float64))
@@ -333,7 +333,7 @@ def _ends(a: BallRun, b: BallRun) -> tuple[int, dict[str, str]]:
 
 
 def _guarded(separation: np.ndarray, furthest: np.ndarray, guard: float | None) -> np.ndarray:
-    """Set distances to NaN after a contact was imposed on a ball far from the floor."""
+    """Set distances between runs to NaN after a contact is imposed far from the floor."""
     beyond = furthest > (np.inf if guard is None else guard)
     if beyond.any():
         separation[int(beyond.argmax()) + 1 :] = np.nan

@@ -73,7 +73,7 @@ class Rounding(eqx.Module):
 
 
 class Motion(NamedTuple):
-    """Input of a contact model for one time step."""
+    """Data that a contact model needs for one time step."""
 
     # y, v, carried: height, velocity and the acceleration that velocity Verlet carries, in the dtype of
     # arithmetic
@@ -139,7 +139,7 @@ class _Euler(eqx.Module):
 
 
 class ExplicitEuler(_Euler):
-    """Explicit Euler (y += h v; v += h a(y)): of order 1; a stiff contact adds energy at any time step."""
+    """Explicit Euler (y += h v; v += h a(y)), of order 1. A stiff contact adds energy at any time step."""
 
     def fly(self, y, v, a, r):
         return r(y + r(self.h * v)), r(v + r(self.h * a))
@@ -168,7 +168,7 @@ class BallVerlet(eqx.Module):
         return y, r(v + r(half * a))
 
     def push(self, pull, motion):
-        """Make one time step. The final height decides contact; damping uses the half-step velocity."""
+        """Make one time step. The final height decides contact. Damping uses the half-step velocity."""
         r = motion.rounding
         y, v, half = self._drift(motion.y, motion.v, motion.carried, r)
         contact = motion.judge(y)
@@ -177,7 +177,7 @@ class BallVerlet(eqx.Module):
 
 
 class ImplicitMidpoint(eqx.Module):
-    """Implicit midpoint scheme, solved by Newton's method; it has order 2 and is stable for any time step.
+    """Implicit midpoint scheme, solved by Newton's method. Order 2, and stable for any time step.
 
     The acceleration is evaluated in the middle of the time step. Derivatives are implicit derivatives of the
     solved equation, not derivatives of the iterations.
@@ -242,7 +242,7 @@ class ImplicitMidpoint(eqx.Module):
 
 
 class EventLocated(eqx.Module):
-    """Exact parabolic flight, in which the time of every impact is located. For `Impact` contacts only."""
+    """Exact parabolic flight with computed times of all impacts. Only for the contact model `Impact`."""
 
     h: Any  # time step, s; the trajectory does not depend on it, only where it is looked at
     max_impacts: int = eqx.field(static=True, default=200)  # the cap on impacts inside one step
@@ -383,7 +383,7 @@ class Impact(_Forceless):
     rest_speed: Any = 1e-6
 
     def move(self, motion: Motion) -> Moved:
-        """Make one time step: flight with all impacts in this step."""
+        """Make one time step of flight, with all impacts during this step."""
         if isinstance(motion.integrator, EventLocated):
             return self._located(motion, motion.integrator)
         r = motion.rounding

@@ -42,7 +42,7 @@ class DecisionTape:
         return {key: tuple(own.tolist()) for key, own in zip(keys.tolist(), steps, strict=True)}
 
     def pins(self, keys: Iterable[int], first: int, last: int) -> Pins:
-        """Return the decisions on pairs between two steps, to impose them on another run."""
+        """Return the decisions on given pairs between two steps, for another run."""
         begins = set(self.first.tolist())
         return Pins(
             [

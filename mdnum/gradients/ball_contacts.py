@@ -70,7 +70,7 @@ class FixedPointRule(eqx.Module):
 
 
 class _Settled(eqx.Module):
-    """Rule that moves balls below the floor up to the floor."""
+    """Rule that lifts balls in contact up to the floor."""
 
     def attach(self, y, gain, contact):
         """Return 0 for balls in contact below the floor, and y for other balls."""

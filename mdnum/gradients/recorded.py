@@ -325,7 +325,7 @@ def joined(crossings: Sequence[Crossings], name: str, *, ledger: bool = False) -
 
 
 def radial_speed(simulation: Simulation) -> float:
-    """Return the rms radial speed of a pair, in length per internal time."""
+    """Return the rms relative speed of two atoms along their connecting line, internal units."""
     speed2 = float(np.mean(np.sum(simulation.velocities**2, axis=1)))
     return float(np.sqrt(2 * speed2 / 3))
 

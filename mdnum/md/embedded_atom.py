@@ -150,7 +150,7 @@ class Spline(eqx.Module):
         return c0 + t * (c1 + t * (c2 + t * c3)), c1 + t * (c2 + t * c3) + t * (c2 + t * c3 + t * c3)
 
     def inside(self, x: Float[Array, "..."]) -> Array:
-        """Return True if x is inside the table, within rounding error."""
+        """Return True if x is inside the table, up to rounding error."""
         slack = 1e-9 * self.step
         return (x >= self.start - slack) & (x <= self.end + slack)
 

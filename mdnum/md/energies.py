@@ -1,4 +1,4 @@
-"""Call energy functions with neighbor lists, whatever the functions' arguments are.
+"""Call energy functions with any arguments over neighbor lists.
 
 Functions for jax-md differ in arguments, box, positions (real or fractional), neighbor lists and return
 value. The signature determines the order of the arguments. All other properties are determined by trial calls

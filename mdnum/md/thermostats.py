@@ -29,7 +29,7 @@ class Chain(NamedTuple):
 
     @classmethod
     def at_rest(cls, links: int) -> Chain:
-        """Return the initial state of a thermostat chain, at rest."""
+        """Return the initial state of a thermostat chain: all thermostats at rest."""
         return cls(jnp.zeros(links), jnp.zeros(links))
 
     def act(
@@ -115,7 +115,7 @@ class NoseHooverChain(Integrator):
 def rescaled(
     key: Array, kinetic: Number, freedom: int, kT: Number, relaxation: Number, time: Number
 ) -> Number:
-    """Return the velocity scale factor of an exact stochastic step of the kinetic energy.
+    """Return the factor for velocities in an exact stochastic step of the kinetic energy.
 
     Bussi, Donadio, Parrinello, J. Chem. Phys. 126, 014101 (2007), eqs. A7 and A8. Zero velocities stay zero.
 

@@ -58,7 +58,7 @@ class Reduction:
     """
 
     def within(self, total: jax.Array, terms: Sequence[jax.Array]) -> tuple[jax.Array, jax.Array | None]:
-        """Process a block of terms. Return the partial sum, and numbers for `finish` (or None)."""
+        """Process a block of terms. Return the partial sum, and data for `finish` (or None)."""
         return total, jnp.stack(list(terms))
 
     def finish(self, total: jax.Array, blocks: jax.Array | None) -> jax.Array:
@@ -95,7 +95,7 @@ class Reduction:
         return np.asarray((factor if factor >= 0 else np.inf) * np.abs(terms.astype(np.float64)).sum(axis=0))
 
     def depth(self, n: int) -> int:
-        """Return the largest number of additions for one term in a sum of n terms."""
+        """Return the largest number of additions that one of n terms passes through."""
         return max(n - 1, 0)
 
 
@@ -248,7 +248,7 @@ class Twice(Reduction):
         return in_order(halves, add, in_order(halves, add))
 
     def depth(self, n: int) -> int:
-        """Return the largest number of additions for one term, over both passes."""
+        """Return the largest number of additions that one term passes through, in both passes."""
         return max(2 * n - 1, 0)
 
 
@@ -313,7 +313,7 @@ class Neumaier(_Compensated):
     """
 
     def sum_of(self, terms: jax.Array, add: Add) -> jax.Array:
-        """Sum the terms with four additions for each term, and a final one."""
+        """Sum the terms with four additions per term and one final addition."""
 
         def step(carry, term):
             total, lost = carry

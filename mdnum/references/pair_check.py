@@ -346,8 +346,8 @@ def effective_cutoff(
 ) -> EffectiveCutoff:
     """Find the largest distance that a neighbor search counts as inside r_cut.
 
-    The first atom is at x = 0, so the distance is the x coordinate of the second. In a periodic box (5 r_cut
-    wide), the result also depends on the wrapping of atoms.
+    The first atom is at x = 0, so the distance is the x coordinate of the second. The periodic box is 5
+    r_cut wide. There, the wrapping of atoms also affects the result.
 
     Args:
         periodic: use a periodic box, as in a simulation; otherwise atoms without a box.

@@ -47,7 +47,7 @@ class Table:
 
 
 def records(rows: Sequence[Mapping[str, Any]], title: str = "", shown: int = 20) -> Table:
-    """Build a table from dictionaries. Columns are in the order of their first occurrence."""
+    """Build a table from dictionaries. Columns have the order in which keys first occur."""
     columns = tuple(dict.fromkeys(name for row in rows for name in row))
     return Table(columns, [[row.get(name) for name in columns] for row in rows], title, shown)
 
@@ -121,7 +121,7 @@ ROLES: tuple[Role, ...] = ("first", "second", "third", "bad", "ink", "muted")
 
 
 def positive(values: np.ndarray) -> np.ndarray:
-    """Return values with NaN where a logarithmic axis has no place (≤ 0 or not finite)."""
+    """Return values with NaN in place of values that a logarithmic axis cannot show."""
     values = np.asarray(values, float)
     return np.where(np.isfinite(values) & (values > 0), values, np.nan)
 
@@ -160,7 +160,7 @@ def points_of(lines: Iterable[tuple[str, str, str, Any, Any]]) -> dict[str, np.n
 
 @dataclass(frozen=True)
 class Region:
-    """Grid of cells. Each cell has an integer, each integer a word (such as "stable")."""
+    """Grid of cells. Each cell has an integer. Each integer stands for a word (such as "stable")."""
 
     # x, y: centers of the cells, shapes (columns,) and (rows,)
     x: np.ndarray

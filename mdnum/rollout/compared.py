@@ -296,7 +296,7 @@ def separations(
     b: Float[np.ndarray, "rows 3 atoms"],
     others: Sequence[Cell] = (),
 ) -> Float[np.ndarray, "rows"]:
-    """Return the largest distance of an atom between two runs, by step. NaN if positions are not finite.
+    """Return the largest distance of an atom between two runs, by step. NaN if a position is NaN.
 
     Args:
         cells: the box, or one box for each row; distances are minimum-image distances.

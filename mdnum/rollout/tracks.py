@@ -86,7 +86,7 @@ _COLUMNS = ("x", "v", "energy", "nearest", "overridden", "furthest")
 
 
 def taken(ahead: list[Rows], last: int) -> Rows | None:
-    """Remove and return the time steps up to a step. None if there are none."""
+    """Remove and return the recorded time steps up to `last`. None if there are none."""
     parts: list[Rows] = []
     while ahead and ahead[0].first <= last:
         rows = ahead.pop(0)
@@ -154,11 +154,11 @@ class Track:
 
     @property
     def ready(self) -> int:
-        """Last time step that has been read."""
+        """Number of the last time step that has been read."""
         return self._ahead[-1].last
 
     def until(self, last: int) -> Rows | None:
-        """Return the time steps up to `last` that were not yet returned. None if there are none."""
+        """Return the time steps up to `last` that have not been returned yet. None if there are none."""
         while not self._ahead or self.ready < last:
             if self.segment() is None:
                 break
@@ -171,7 +171,7 @@ class Track:
         return every[every.step <= last]
 
     def doubts(self, last: int) -> AmbiguousPairs:
-        """Return the ambiguous decisions up to step `last` that were not yet returned."""
+        """Return the ambiguous decisions up to step `last` that have not been returned yet."""
         every = AmbiguousPairs.concatenate(self._doubts)
         taken = every[every.step <= last]
         self._doubts = [every[every.step > last]]

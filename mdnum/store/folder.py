@@ -514,7 +514,7 @@ class RunFolder:
         return self._read_json("provenance.json")
 
     def damaged(self) -> dict[str, str]:
-        """Return the names of changed or missing files, with a description of each problem.
+        """Return the names of changed or missing files, and what is wrong with each file.
 
         Raises:
             FolderError: the manifest itself is damaged.
@@ -631,7 +631,7 @@ class RunFolder:
         return self._manifest[1]
 
     def _wrong(self, name: str) -> str:
-        """Return how a file differs from the manifest. "" if the file is intact or not listed."""
+        """Return how a file differs from the manifest. "" for intact and for unlisted files."""
         allowed = self._listed().get(name)
         if allowed is None:
             return ""
@@ -670,7 +670,7 @@ class RunFolder:
         return {name: stream.rows for name, stream in self._streams.items()}
 
     def _settle(self) -> None:
-        """Wait until the current checkpoint is written. Raise the error of its thread, if any."""
+        """Wait until the current checkpoint is written. Raise any error of its thread."""
         if self._writing is not None:
             written, self._writing = self._writing, None
             written.result()

@@ -141,7 +141,7 @@ def _along(
     reference: Setting,
     names: Sequence[str],
 ) -> dict[str, dict[str, Raw]]:
-    """Return the differences between settings and a reference setting, by measure and label."""
+    """Return the differences from a reference setting, by measure and label of the setting."""
     found = {}
     for name in names:
         runs = results.values.get(name, {})

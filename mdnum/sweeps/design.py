@@ -125,7 +125,7 @@ def points(
     design: Design = "one-at-a-time",
     samples: int = 0,
 ) -> list[Point]:
-    """Return all points, ordered by seed.
+    """Return all points of a sweep, ordered by seed.
 
     Args:
         base: the value of each axis that is kept while another axis is varied.

@@ -88,7 +88,7 @@ def parameters(simulation: Simulation) -> dict[str, Parameter]:
 
 
 def names(simulation: Simulation) -> tuple[str, ...]:
-    """Return the paths of all parameters, without paths of single array entries."""
+    """Return the paths of all parameters. Single array entries are omitted."""
     model, draw = simulation.model, simulation.draw
     if simulation.pairwise:
         found = list(pair_leaves(model))
@@ -100,7 +100,7 @@ def names(simulation: Simulation) -> tuple[str, ...]:
 
 
 def numbers(simulation: Simulation) -> tuple[str, ...]:
-    """Return the paths of all scalar parameters, without single coordinates and weights."""
+    """Return the paths of all scalar parameters. Single coordinates and weights are omitted."""
     file = simulation.origin.system
     # as its file has it the radius would move along with sigma
     ends = [] if file is None else [one.cutoff for one in file.spec.interactions.values()]
@@ -134,7 +134,7 @@ def is_positive(simulation: Simulation, name: str) -> bool:
 
 
 def by(simulation: Simulation, name: str) -> str:
-    """Return "pair type", "species" or "atom" if a parameter has one entry for each, else ""."""
+    """Return what a parameter has one entry for: "pair type", "species", "atom" or ""."""
     if name.startswith("initial.") or is_weight(name):
         return "atom"
     if not _is_typed(simulation, name) or simulation.pair_types == 1:

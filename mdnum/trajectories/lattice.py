@@ -52,7 +52,7 @@ class ReducedLattice(NamedTuple):
         return float(1.0 / abs(np.linalg.det(self.inverse)))
 
     def rounding(self, largest: float, radius: float) -> float:
-        """Return the rounding error (length) of a distance near `radius`.
+        """Return a bound on the rounding error (length) of a distance near `radius`.
 
         Source: Higham, Accuracy and Stability of Numerical Algorithms, 2nd ed., section 3.1.
         """
@@ -172,7 +172,7 @@ def near_squares(x, i, j, lattice, y, squares):
 
 @njit
 def image_square(x, i, j, rank, lattice):
-    """Return the squared distance from atom i to an image of atom j. `rank` counts nearer images.
+    """Return the squared distance from atom i to an image of atom j. `rank` images are nearer.
 
     Either i < j, or i == j (opposite images count once). If no image of j has the given rank, the result is
     inf.
@@ -258,7 +258,7 @@ class Participants:
 
 @dataclass(frozen=True)
 class Placed:
-    """Positions and reduced lattice at one frame, for one membership rule."""
+    """Positions and reduced lattice vectors of one frame, for one membership rule."""
 
     positions: Float[np.ndarray, "atoms 3"]  # as stored, anywhere, length
     lattice: ReducedLattice  # of the box
@@ -444,7 +444,7 @@ def _run(d0, d1, d2, b0, b1, b2, bins, last):
 
 @njit
 def _most_around(bins, reach, start):
-    """Return upper limits of the numbers of atoms and rows of bins near one bin."""
+    """Return upper limits of the number of atoms and of rows of bins near one bin."""
     atoms, runs = 0, 0
     for b0 in range(bins[0]):
         for b1 in range(bins[1]):
@@ -465,7 +465,7 @@ def _most_around(bins, reach, start):
 # candidate, and the loop its vector instructions.
 @njit(inline="never")
 def _within(near, first, last, x0, x1, x2, largest, squares, flags, chosen):
-    """List and count the atoms whose squared distance from x is up to `largest`."""
+    """List and count the atoms whose squared distance from a point is at most `largest`."""
     near0, near1, near2 = near[0, first:last], near[1, first:last], near[2, first:last]
     for k in range(near0.shape[0]):
         y0, y1, y2 = near0[k] - x0, near1[k] - x1, near2[k] - x2

@@ -96,7 +96,7 @@ class GivenList(NamedTuple):
         return _has(self.first, self.j, self.image, i, j, image, self.shifted)
 
     def missing(self, frame: Frame, pairs: Members) -> Int[np.ndarray, "pairs"]:
-        """Return the number of missing entries of each pair, up to 2 in a full list."""
+        """Return the number of missing entries of each pair. A full list has two per pair."""
         i, j, image, near = pairs.i, pairs.j, np.zeros(len(pairs), np.int64), pairs.rank == 0
         if self.shifted:
             image, near = _image(*image_shifts(frame, pairs).T), np.True_
@@ -207,7 +207,7 @@ class ListCheck:
         flips: Mapping[str, np.ndarray],
         now: GivenList,
     ) -> tuple[dict[str, Any], list[dict[str, Any]]]:
-        """Compare a list with the pairs inside the cutoff. Return (results, rows of pairs that were missing).
+        """Compare a list with the pairs inside the cutoff. Return results, and rows of missing pairs.
 
         Args:
             at: index of the frame among the frames examined.
@@ -250,7 +250,7 @@ class ListCheck:
         return row, self.ended(at, tracker.bound, {key: known[key] for key in gone})
 
     def _drops(self, earlier: GivenList, now: GivenList, frame: Frame, before: Frame, placed: Placed) -> bool:
-        """Return True if the list may lack pairs that the previous list contained."""
+        """Return True if the new list may lack pairs that the previous list contained."""
         i, j, image, reach = earlier.i, earlier.j, earlier.image, self._rule.reach
         x, (matrix, inverse) = placed.positions, cell_of(frame)
         if (earlier.shifted, earlier.full) != (now.shifted, now.full):
@@ -273,7 +273,7 @@ class ListCheck:
         return bool((distance <= self._radii[self._kinds[i], self._kinds[j]] + placed.rounding).any())
 
     def ended(self, at: int, bound: float, stays: Mapping[Any, Any] | None = None) -> list[dict[str, Any]]:
-        """Return table rows of pairs missing until frame `at`. `stays` restricts the pairs."""
+        """Return table rows of the pairs that were missing until frame `at`. `stays` restricts the pairs."""
         names = ("i", "j", "rank", "missing", "begin", "number", "deepest", "end")
         held = sorted((self._open if stays is None else stays).items())
         rows = [(*key, *told, at) for key, told in held if told[-1] > bound]

@@ -366,7 +366,7 @@ def _summary(state: AuditState) -> dict[str, Any]:
 
 
 def _tables(state: AuditState) -> dict[str, dict[str, np.ndarray]]:
-    """Return the audit's tables: points of figures, and data of checks."""
+    """Return the tables of an audit: the points of figures and the data of checks."""
     lines = [
         (result.name, f"{result.name}-{place}", label, chart.x, values)
         for result in state.shown
@@ -410,7 +410,7 @@ def _by_cause(found: Sequence[Observed]) -> list[tuple[Observed, list[Observed]]
 
 
 def _finding(one: Observed, section: str, cause: str, texts: Texts = TEXTS) -> Finding:
-    """Return a finding with its sentences, from audit.toml or the check's package."""
+    """Return a finding with sentences from audit.toml or from the check's package."""
     if one.code not in TEXTS.entries:
         given = {name: str(one.values.get(name, "")) for name in ("title", "text", "remedy")}
         return Finding(one.code, one.severity, **given, values=one.values, section=section, cause=cause)

@@ -143,7 +143,7 @@ def _simulate(problem: BallProblem, progress: Progress | None) -> tuple[BallRun,
 def _differentiated(
     simulation: BallSimulation, run: BallRun, progress: Progress | None
 ) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
-    """Return loss, derivatives and variants, and a table of height differences."""
+    """Return the loss, derivatives, variants, and a table of height differences."""
     from mdnum.ball.rollout import first_difference
     from mdnum.verbs import ball_record
 

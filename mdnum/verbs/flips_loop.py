@@ -53,7 +53,7 @@ def _lists_told(loop: Mapping[str, np.ndarray], folder: RunFolder) -> dict[str, 
 
 
 def _energy_told(loop: Mapping[str, np.ndarray], folder: RunFolder) -> dict[str, Any] | None:
-    """Return statistics of the energy, such as the variance due to flips."""
+    """Return statistics of the energy in a loop, such as the variance due to flips."""
     energy = loop["energy"]
     if len(energy) < 4 or not np.isfinite(energy).all():
         return None
@@ -81,7 +81,7 @@ def _energy_told(loop: Mapping[str, np.ndarray], folder: RunFolder) -> dict[str,
 def findings(
     view: FlipsView, lists: Mapping[str, Any] | None, energy: Mapping[str, Any] | None
 ) -> Iterator[Finding]:
-    """Yield findings on missing pairs, list overflow, and energy jumps."""
+    """Yield findings on missing pairs, overflows of neighbor lists, and energy jumps."""
     if lists and (worst := lists["worst"]) is not None:
         values = {"pair": f"{worst['i']}–{worst['j']}", "missed": worst["frames"]}
         again, deepest = ["again"] * (lists["times"] > lists["lost"]), view.length(worst["deepest"])

@@ -76,7 +76,7 @@ def _headline(view: View) -> tuple[str, dict[str, Any]]:
 
 
 def agreeing(view: View) -> str:
-    """Return a phrase on how many repeats diverge later if decisions are imposed."""
+    """Return a phrase on how many repeated runs diverge later if decisions are imposed."""
     said: list[str] = []
     for name in ("count", "count_other"):
         if count := view.summary.get(name):
@@ -108,13 +108,13 @@ def _evidence(view: View) -> Iterator[str]:
 
 
 def decided(decision: Mapping[str, Any]) -> str:
-    """Return the key of the sentence on a decision that differs."""
+    """Return the key of the sentence on a decision that differs between runs."""
     name = "at_start" if decision["run"] == "start" else decision["channel"]
     return f"decided_{name}{'_term' * bool(decision.get('terms'))}"
 
 
 def sides(decision: Mapping[str, Any]) -> dict[str, Any]:
-    """Return a decision in runs A and B, and the run in which it is true."""
+    """Return what runs A and B decided, and the run in which the decision is true."""
     yes = "A" if decision["decided"]["A"] > decision["decided"]["B"] else "B"
     return {"yes": yes, "no": "B" if yes == "A" else "A", "a": decision["decided"]["A"],
             "b": decision["decided"]["B"]}  # fmt: skip

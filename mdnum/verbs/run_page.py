@@ -297,7 +297,7 @@ def _energy(run: RunView) -> Iterator[Any]:
 
 
 def _pressure(run: RunView) -> Iterator[Any]:
-    """Yield the contributions to the pressure, such as the kinetic part."""
+    """Yield the contributions to the pressure, such as the kinetic contribution."""
     units, parts = run.units, run.summary.get("pressure")
     if not parts:
         return

@@ -59,7 +59,7 @@ TRUSTED, LIMITED, UNDECIDED = "trusted", "limited", "undecided"
 
 
 class Shorter(Loss):
-    """A loss of several runs with the same start and different last steps (horizons)."""
+    """Losses of several runs that have the same start and different last steps (horizons)."""
 
     name = "shorter"
     inner: Loss = eqx.field(kw_only=True)  # the loss
@@ -402,7 +402,7 @@ def no_half_step(simulation: Simulation) -> bool:
 def verdict_of(
     limits: Sequence[Limit], steps: int, chaotic: bool, skipped: bool
 ) -> tuple[str, int, str, tuple[str, ...]]:
-    """Return the verdict, its horizon, the first limit, and the limits not examined."""
+    """Return the verdict, the horizon, the first limit reached, and the unexamined limits."""
     examined = [one for one in limits if one.horizon is not None]
     horizon = min((one.horizon or 0 for one in examined), default=0)
     met = [one.what for one in examined if one.reached and one.horizon == horizon]

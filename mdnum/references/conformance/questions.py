@@ -120,7 +120,7 @@ def _outside() -> Named:
 
 
 def _across_walls() -> ndarray:
-    """Return pairs along x, just less than r_cut apart, near a multiple of r_cut.
+    """Return pairs of atoms along x, slightly less than r_cut apart, near multiples of r_cut.
 
     After rounding to float32, the atoms of a pair may be two grid cells apart.
     """
@@ -163,7 +163,7 @@ def _crowds() -> Named:
 
 
 def vast() -> Iterator[Case]:
-    """Yield test cases whose volume is too large for a simple cell grid.
+    """Yield test cases whose box is too large for a simple grid of cells.
 
     Cases with very large volume run in a separate process.
     """
@@ -176,8 +176,8 @@ def vast() -> Iterator[Case]:
 def lattice(edge: int, seed: int = 0) -> Case:
     """Return atoms on a cubic lattice with vacancies, in random order and random periodic images.
 
-    The neighbors of each atom are on the 26 sites around it. Neighbors are found from site indices, without
-    rounding.
+    The neighbors of each atom are on the 26 sites around it. Expected neighbors follow from site indices,
+    without rounding.
 
     Args:
         edge: number of sites along an edge.
@@ -358,7 +358,7 @@ def plan(
 ) -> list[tuple[int, Iterable[Case]]]:
     """Return groups of test cases as tuples (number of cases, cases).
 
-    First come up to `BREADTH` named test cases of each area, then random and large test cases.
+    Up to `BREADTH` named test cases of each area precede random and large test cases.
 
     Args:
         count: number of random cases.
