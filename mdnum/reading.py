@@ -144,7 +144,7 @@ def reading(
 
 
 def check_claim(path: str | Path, atoms: int | None = None) -> None:
-    """Raise an error if a file claims an impossible number of atoms.
+    """Raise an error if a file states an impossible number of atoms.
 
     Args:
         path: the file.

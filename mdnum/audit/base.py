@@ -39,7 +39,7 @@ TIME_UP, CALLS_UP = TimeUp.why, CallsUp.why
 
 
 class CalculatorError(MdnumError):
-    """The calculator raised an exception, or returned a number that is not finite.
+    """Raised when the calculator raised an exception, or returned a number that is not finite.
 
     Args:
         structure: file with the structure on which the calculator failed; None if it was not saved.
@@ -55,7 +55,7 @@ class CalculatorError(MdnumError):
 
 @dataclass
 class Meter:
-    """Counts the calls to a calculator, and limits calls and time.
+    """Counter of calls to a calculator, with limits on calls and time.
 
     Limits on calls make results independent of the load of the machine. A deadline can also end a check.
     """

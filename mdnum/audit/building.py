@@ -266,7 +266,7 @@ def _processor_time(subject: CalculatorSubject, atoms: Atoms) -> float:
 
 
 def _felt(subject: CalculatorSubject, pair: Pair) -> tuple[float | None, float | None]:
-    """Estimate the cutoff and the distance of lowest energy of a pair. Both may be None.
+    """Estimate the cutoff of a pair of particles, and the distance of lowest energy. Both may be None.
 
     If the calculator fails on atoms without neighbors, it begins to fail at the cutoff.
     """

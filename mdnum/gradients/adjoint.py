@@ -1,7 +1,7 @@
 """Reverse-mode derivatives of a simulation at its recorded states and decisions.
 
 With jax.value_and_grad, the forward pass rounds differently from an ordinary run. After some thousand steps,
-its decisions differ from those of the run. This module therefore records an ordinary run first.
+forward pass and run make different decisions. This module therefore records an ordinary run first.
 
 A conservative force is a gradient, so its Jacobian J is symmetric. For a pair potential, J times a vector is
 a sum over neighbors, like the forces. For other energies, J times a vector is a directional derivative of the

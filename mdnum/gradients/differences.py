@@ -435,7 +435,7 @@ class SmoothedDifferences(Method):
     """Gradient method: mean over replicas of central differences that span many flips.
 
     The two runs of a difference use the same random numbers. Differences with steps h and h/2 are
-    extrapolated to h = 0. The result is the extrapolation from the widest steps that agrees with all narrower
+    extrapolated to h = 0. The result is the extrapolation from the largest step that agrees with all smaller
     steps, within twice the standard error. Smaller steps increase the noise due to single flips.
     """
 

@@ -79,9 +79,9 @@ class FixedPointUnits:
     ) -> FixedPointUnits:
         """Choose the units for a box, a neighbor list radius and a potential.
 
-        The position spacing is the smallest power of two with exact squared distances of listed pairs. The
-        unit of force is the smallest for which all sums of momenta and forces are exact. The unit of momentum
-        is the unit of force times half a time step.
+        The position spacing is the smallest power of two for which squared distances of listed pairs are
+        exact. The unit of force is the smallest for which all sums of momenta and forces are exact. The unit
+        of momentum is the unit of force times half a time step.
 
         Args:
             r_list: radius of the neighbor lists, length.
@@ -134,7 +134,7 @@ class FixedPointUnits:
         return np.round(np.asarray(x, np.float64) / self.spacing) * self.spacing
 
     def total(self, terms: Float[Any, "*shape"]) -> Float[Any, ""]:
-        """Return the sum of energies, each rounded to the unit of energy. Their order has no effect."""
+        """Round energies to the unit of energy, and return their sum. The order of terms has no effect."""
         return jnp.sum(jnp.round(terms * (1 / self.energy))) * self.energy
 
     def to_dict(self, timestep: float) -> dict[str, float]:

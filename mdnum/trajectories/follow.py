@@ -172,7 +172,7 @@ def follow(
 ) -> Iterator[Pass]:  # fmt: skip
     """Read each frame once. Pass rows of the tables "members", "flips", "frames" and "motion" to `sink`.
 
-    If `residues` is given, pairs of residues are examined. Even then, `groups` contains atoms. The same
+    If `residues` is given, pairs of residues are examined, but `groups` contains atoms. The same
     `Pass` is yielded after each frame. Iteration may stop at any frame. Memory use does not grow with the
     number of frames. Reading ends at the first unreadable or unusable frame. Earlier results are kept.
 

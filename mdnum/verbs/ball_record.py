@@ -274,7 +274,7 @@ def rule_of(run: BallRun) -> Any:
 
 
 def solved(run: BallRun) -> np.ndarray:
-    """True for each step (and ball, with separate solvers) at which the solver was needed."""
+    """True for each step (and each ball, if solvers are separate) at which a solver was needed."""
     if rule_of(run) is None:
         return run.reason != Reason.NONE.value
     if isinstance(run.world.contact, Penalty):

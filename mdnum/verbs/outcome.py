@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, repr=False)
 class Outcome:
-    """Summary and verdict of a command. Its methods return tables and figures.
+    """Summary and verdict of a command, with methods for its tables and figures.
 
     An outcome can be pickled and returned by worker processes. Do not move the output folder: tables and
     figures are read on first use.

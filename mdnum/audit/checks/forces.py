@@ -341,7 +341,7 @@ def _row(one: Slope) -> dict[str, Any]:
 
 
 def _chart(slopes: list[Slope]) -> Chart:
-    """Chart of force error versus step. Correct forces give a minimum, others a plateau."""
+    """Chart of force error versus step. Correct forces give a minimum, wrong forces a plateau."""
     shown = slopes[:_DIRECTIONS]
     shown += [one for one in [_worst(slopes)] if one not in shown]
     lines = {one.direction: one.gaps[::-1].tolist() for one in shown}

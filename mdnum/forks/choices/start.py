@@ -382,7 +382,7 @@ class NoiseChoice(Choice):
 class EnergyShift(Choice):
     """Pair energies shifted to zero at the cutoff, or not shifted.
 
-    The conserved energies of the two programs differ, but their trajectories do not.
+    The conserved energies of the two runs differ, but their trajectories do not.
     """
 
     worlds = ("md",)

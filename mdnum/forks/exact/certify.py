@@ -163,7 +163,7 @@ def _certify_md(system: Simulation, last: int, policies: Mapping[str, Roles], no
     matrix = np.where(np.array(simulation.pbc)[:, None], np.asarray(simulation.cell.matrix), 0.0)
 
     def reduced(x: Float[np.ndarray, "... 3"]) -> Float[np.ndarray, "... 3"]:
-        """Wrap positions into the box. Their nearest images are at most one lattice vector away."""
+        """Wrap positions into the box, so that nearest images are at most one lattice vector away."""
         return x - np.floor(x @ np.asarray(simulation.cell.inverse)) @ matrix
 
     rows = []
