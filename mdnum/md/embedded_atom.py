@@ -234,7 +234,7 @@ def embedded_atom(
 
 
 def _smoothness(table: Setfl, pair: Spline, density: Spline, embedding: Spline) -> Smoothness:
-    """Return limits of energy and force jumps at r_cut. A crossing changes a pair term and two densities."""
+    """Return upper limits of the energy and force jumps if a pair crosses r_cut."""
     steepest = np.max(np.abs(embedding.on_host(table.drho * np.arange(len(table.embedding)))[1]))
     at = np.array([table.r_cut])
     energy, force = (

@@ -115,7 +115,7 @@ class NoseHooverChain(Integrator):
 def rescaled(
     key: Array, kinetic: Number, freedom: int, kT: Number, relaxation: Number, time: Number
 ) -> Number:
-    """Return the factor for velocities in an exact stochastic step of the kinetic energy.
+    """Return the factor that scales velocities in an exact stochastic step of the kinetic energy.
 
     Bussi, Donadio, Parrinello, J. Chem. Phys. 126, 014101 (2007), eqs. A7 and A8. Zero velocities stay zero.
 

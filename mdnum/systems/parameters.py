@@ -134,7 +134,7 @@ def is_positive(simulation: Simulation, name: str) -> bool:
 
 
 def by(simulation: Simulation, name: str) -> str:
-    """Return what a parameter has one entry for: "pair type", "species", "atom" or ""."""
+    """Return what each entry of a parameter belongs to: "pair type", "species", "atom" or ""."""
     if name.startswith("initial.") or is_weight(name):
         return "atom"
     if not _is_typed(simulation, name) or simulation.pair_types == 1:

@@ -307,7 +307,7 @@ def left_over(trajectory: Any) -> str | None:
 
 
 def _behind_dcd(path: Path, frames: int) -> tuple[int, int]:
-    """Return the number of bytes after the last DCD frame, and of a frame."""
+    """Return the sizes (bytes) of the data after the last DCD frame and of one frame."""
     from MDAnalysis.lib.formats.libdcd import DCDFile
 
     with DCDFile(str(path)) as file:
