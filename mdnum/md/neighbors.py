@@ -127,7 +127,7 @@ class ListBuilder(Protocol):
     def build(
         self, positions: Float[np.ndarray | Array, "atoms 3"], cell: Cell, r_list: float, slots: int
     ) -> tuple[Int[np.ndarray | Array, "slots atoms"], Int[np.ndarray | Array, "atoms"], int]:
-        """Return pair table, atom order and neighbor count. If the count exceeds `slots`, pairs are missing."""
+        """Return table, atom order and neighbor count. If the count exceeds `slots`, pairs are missing."""
         ...
 
 
