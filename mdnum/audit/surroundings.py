@@ -190,7 +190,7 @@ def _groups(atoms: Atoms, single: bool) -> list[np.ndarray]:
 
 
 def _cut_out(atoms: Atoms, groups: Sequence[np.ndarray], pair: Pair) -> Atoms:
-    """Return a cluster of the groups nearest to the first group, in the cell of a pair of atoms."""
+    """Return a cluster of the groups nearest to the first group, in the cell of a pair scan."""
     center = _lead(atoms, groups[0])
     offsets = atoms.get_distances(center, np.arange(len(atoms)), mic=bool(atoms.pbc.any()), vector=True)
     nearest = np.argsort([np.linalg.norm(offsets[_lead(atoms, group)]) for group in groups])

@@ -172,7 +172,7 @@ _COUNTS: dict[tuple[Any, int], tuple[int, ...]] = {}
 
 
 def undecided(world: World, start: BallState, steps: int) -> BallDecisions:
-    """Return arrays of decisions that impose no decision (-1)."""
+    """Return arrays in which no decision is imposed (-1)."""
     kind = jax.tree.structure(world), len(start.y)
     if kind not in _COUNTS:
         solve = eqx.filter_eval_shape(lambda world, start: world.advance(start)[1].solve, world, start)

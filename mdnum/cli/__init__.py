@@ -143,7 +143,7 @@ _EXPECTED = {"int_parsing": "a whole number", "int_from_float": "a whole number"
 
 
 def _said(error: Any) -> str:
-    """Return the message of a usage error. If a number was expected, quote the text."""
+    """Return the message of a usage error. If a number was expected, quote the user's text."""
     details = getattr(error.__cause__, "errors", None)
     if details is None or details()[0]["type"] not in _EXPECTED:
         return error.format_message()

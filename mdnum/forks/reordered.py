@@ -8,8 +8,8 @@ sum over the atom's own row. An ordered-sparse list contains each pair of atoms 
 larger labels form one sum, those from smaller labels a second sum.
 
 Source: jax_md.smap.pair_neighbor_list of jax-md 0.2.29, whose forces are reproduced bit for bit
-(tests/forks/test_choices.py). XLA adds more than 32 slots of an atom in blocks of 32. Such blocks are not
-reproduced here.
+(tests/forks/test_choices.py). If an atom has more than 32 slots, XLA adds them in blocks of 32. Such blocks
+are not reproduced here.
 """
 
 from __future__ import annotations

@@ -285,7 +285,7 @@ class BoundaryTerm(Method):
         return self.result(tape.value, gradient, details={"frames": len(seen), **details})
 
     def terms(self, simulation: Simulation, seen: Frames, names: Sequence[str], progress=None):
-        """Return the contribution of each frame to each derivative, and the errors."""
+        """Return the contribution of each frame to each derivative, and the derivatives' errors."""
         energy, force = simulation.jumps()
         radii = np.asarray(simulation.decider.r_cut)
         # what a pair that enters adds to the loss of each frame

@@ -210,7 +210,7 @@ def of_energy(
     """Compute cotangents of crossing distances. The energy is evaluated with and without each pair.
 
     The jump affects all atoms whose energy depends on the pair. The jump is evaluated at the cutoff distance.
-    Other pairs have their decisions at the end of the step.
+    For other pairs, the decisions at the end of the step are used.
 
     Args:
         met: crossings whose `push` is one over the radial speed, negative where the pair leaves.

@@ -362,7 +362,7 @@ def listed(simulation: Simulation, table: PairTable) -> tuple[np.ndarray, np.nda
 
 
 def frame_of(row, order: Int[Array, "atoms"], matrix: Float[Array, "3 3"]) -> LossFrame:
-    """Convert a recorded step to a `LossFrame`. Positions are unwrapped, atoms in the user's order."""
+    """Convert a recorded step to a `LossFrame`. Positions are unwrapped. Atoms are in the user's order."""
     step, x, v, images, potential, virial = row[:6]
     whole = x + (matrix.T @ images.astype(matrix.dtype)).astype(x.dtype)
     return LossFrame(step, unsorted(whole, order), unsorted(v, order), potential, virial)
@@ -389,7 +389,7 @@ def _summed(loss, total, rows, used, seen, origin, around, order):
 
 
 def in_box(around: LossContext, matrix: Float[Array, "3 3"]) -> LossContext:
-    """Return the context of a loss (masses, box, constants) with other lattice vectors."""
+    """Return the context of a loss (masses, box, constants) with changed lattice vectors."""
     volume = jnp.abs(jnp.dot(matrix[0], jnp.cross(matrix[1], matrix[2])))
     return around._replace(matrix=matrix, volume=jnp.where(around.volume > 0, volume, 0.0))
 

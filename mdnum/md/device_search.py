@@ -89,7 +89,7 @@ def _binned(x, cell: Cell, low, span, bins: _Whole):
 def _searched(
     x, places, cell: Cell, start, r2_list, bins: _Whole, reach: _Whole, room: int, slots: int, blocks: int
 ):
-    """Return the neighbors of each atom and their largest number. Neighbors beyond `slots` are missing."""
+    """Return the neighbors of each atom and their largest number. At most `slots` neighbors are kept."""
     atoms = x.shape[1]
     matrix = cell.matrix
     # layer after layer along the third axis, as the host goes

@@ -220,7 +220,7 @@ def _number(value: Any, kind: str = "VEC") -> str:
 
 
 def _whole_power(equation: Any, inputs: list[Any]) -> int:
-    """Return the exponent of a power that is computed by products, and 0 otherwise."""
+    """Return the exponent of a power that is computed by products; 0 for other operations."""
     name, y = equation.primitive.name, inputs[-1]
     if name in ("square", "integer_pow"):
         return equation.params.get("y", 2)
@@ -484,7 +484,7 @@ def _divide_once(
     powers: dict[str, tuple[str, int]],
     block: str,
 ) -> None:
-    """Replace divisions by powers of a number with products of its inverse.
+    """Replace each division by a power of a number with multiplications by the inverse.
 
     Args:
         block: name of the block to which the lines belong; names of inverse powers contain it.

@@ -64,7 +64,7 @@ class PairCounts:
 
 
 class Scan:
-    """Statistics of a table of flips. The table is read in blocks and may exceed the memory.
+    """Statistics of a table of flips. The table is read in blocks and may be larger than the memory.
 
     The statistics contain the margin of every flip, and counts by pair, step and residence time.
 

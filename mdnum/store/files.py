@@ -134,7 +134,7 @@ def replacing(path: Path) -> Iterator[BinaryIO]:
 
 
 def write_bytes(path: Path, data: bytes | memoryview) -> None:
-    """Replace the contents of a file. Update its entry in the manifest, if any.
+    """Replace the contents of a file. Update the file's entry in the manifest, if any.
 
     Raises:
         FolderError: the disk is full, or the folder cannot be written; no partial file remains.
@@ -230,7 +230,7 @@ def digest_of_file(file: BinaryIO) -> str:
 
 
 def load(root: Path) -> Manifest | None:
-    """Return the manifest of a run folder. None if there is none, as in older versions.
+    """Return the manifest of a run folder. None if there is no manifest, as in older versions.
 
     Raises:
         FolderError: the manifest is damaged.

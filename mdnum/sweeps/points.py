@@ -161,7 +161,7 @@ class Workspace:
     # --- claims -------------------------------------------------------------------------------------------
 
     def claims(self, address: str = "*") -> list[tuple[Path, int]]:
-        """Return the claim files of one or all points, in the order of their numbers."""
+        """Return the claim files of one point or of all points, in the order of claim numbers."""
         found = [(file, _CLAIM.fullmatch(file.name)) for file in self._held.glob(f"{address}.*")]
         numbered = [(file, int(match["number"])) for file, match in found if match]
         return sorted(numbered, key=lambda one: (one[0].stem, one[1]))

@@ -82,7 +82,7 @@ def write(simulation: Simulation, folder: Path) -> None:
 
 
 def keys_of(a: Simulation, b: Simulation) -> tuple[dict[str, Any], dict[str, Any]]:
-    """Return tables of two simulations for comparison. Use system files if both have one."""
+    """Return tables of two simulations for comparison. Use the system files if both simulations have one."""
     files = [one.origin.system for one in (a, b)]
     if a.file is not None and None not in files:
         first, second = (one.spec.model_dump(mode="json") for one in files if one is not None)

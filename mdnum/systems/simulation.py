@@ -253,7 +253,7 @@ class Simulation:
         return {"i": i, **self.terms_of(channel * self.pair_types)}
 
     def terms_of(self, kind: Any) -> dict[str, Any]:
-        """Return a table column with each decision's potential term, if there are several channels."""
+        """Return a table column with the potential term of each decision, if terms decide separately."""
         if self.channels == 1:
             return {}
         names = np.array([part.potential.name for part in self.model.parts])

@@ -109,7 +109,7 @@ class LostFlips:
 def lost_flips(
     found: Strides, motion: FrameMotion | None = None, flux: Any = None, reach: float = math.nan
 ) -> LostFlips | None:
-    """Estimate the missed flips. None without flips or with fewer than three frame intervals.
+    """Estimate the missed flips. None without flips or for fewer than three frame intervals.
 
     Args:
         found: number of flips found at each stride.

@@ -269,7 +269,7 @@ class FlipsView(View):
 
 
 def average(mean: float) -> str:
-    """Format the mean of a count: four significant digits, or an integer from 1000."""
+    """Format the mean of a count with four significant digits, from 1000 on as an integer."""
     return count(round(mean)) if mean >= 1000 else number(mean, 4)
 
 

@@ -72,7 +72,7 @@ def last_step(system: Any, steps: int | None, most: int | None = None) -> int:
 def of_md(
     system: Any, overrides: Mapping[str, Any] | None, question: str, pairwise: bool = False
 ) -> Simulation:
-    """Return the simulation of a molecular-dynamics system; raise an error for unsupported systems.
+    """Return the simulation of a molecular-dynamics system. Raise an error for unsupported systems.
 
     Args:
         question: name in the text keys "ball_<question>", the alternative for a ball, and

@@ -421,7 +421,7 @@ def store(folder: RunFolder, summary: Mapping[str, Any], tables: Mapping[str, An
 
 
 def words(texts: Sequence[str] | str) -> tuple[str, ...]:
-    """Return the distinct words of one or several texts, separated by commas."""
+    """Return the distinct words of one or several texts, joined by commas."""
     texts = (texts,) if isinstance(texts, str) else texts
     return tuple(dict.fromkeys(word.strip() for text in texts for word in text.split(",") if word.strip()))
 

@@ -25,7 +25,7 @@ _INSIDE = {True: "yes", False: "no", None: "not decided"}
 
 
 def _shown(view: View, name: str) -> str:
-    """Shorten the path in a measure's name as long as the name is unique."""
+    """Shorten the path in a measure's name as far as the name stays unique."""
     parts, others = Path(name).parts, [one["name"] for one in view.summary["measures"] if one["name"] != name]
     ends = ["/".join(parts[-k:]) for k in range(1, len(parts))] if ".py:" in name else []
     return next((end for end in ends if not any(one.endswith(f"/{end}") for one in others)), name)

@@ -136,7 +136,7 @@ def installed() -> bool:
 
 
 def unsupported(simulation: Simulation) -> InputError | None:
-    """Return an error that states a remedy if the system cannot be certified."""
+    """Return an error with a remedy if the decisions of a system cannot be certified."""
     half, atoms = float(np.min(simulation.cell.widths)) / 2, simulation.atoms
     alone = simulation.pairwise and not isinstance(simulation.potential, SumPotential)
     reasons = (

@@ -1,4 +1,4 @@
-"""Diagnose a gradient: up to which step it can be trusted, and what contributes to it.
+"""Diagnose a gradient: up to which step it can be trusted, and what contributes to the gradient.
 
 Gradient methods compute different quantities: derivatives of the time steps, derivatives that include changes
 of flip times, finite differences of the loss, finite differences of an ensemble average, or derivatives of
@@ -262,7 +262,7 @@ def diagnose(
     format: str = "float16",
     progress: Progress | None = None,
 ) -> GradientDiagnosis:
-    """Find the last step up to which a gradient can be trusted, and what contributes to it.
+    """Find the last step up to which a gradient can be trusted, and what contributes to the gradient.
 
     Args:
         names: parameters, full or short names. parts: which of PARTS to compute.

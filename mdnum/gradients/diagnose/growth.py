@@ -284,7 +284,7 @@ class TangentImage:
 
 
 class Jacobian:
-    """Derivative of the last state with respect to the first, at fixed decisions.
+    """Derivative of the last state with respect to the first state, at fixed decisions.
 
     A state contains all positions, and all velocities times the internal time `clock`.
 

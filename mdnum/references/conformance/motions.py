@@ -344,7 +344,7 @@ def _dozen(room: float, way: ndarray, share: float, n: int) -> list[ndarray]:
 
 
 def _in_turn(room: float, ways: list[ndarray]) -> Case:
-    """Return a test case in which 50 atoms move in turn, to find atoms that a list ignores."""
+    """Return a test case in which 50 atoms move in turn, to find atoms that a neighbor list ignores."""
     count = 25
     way = np.array([ways[n % len(ways)] for n in range(count)])
     start = _around(_places(count, 15.0, 0), room, way)
