@@ -299,7 +299,7 @@ def _run(task: tuple[NumberLine | bytes, int]) -> DecisionHistory:
 def _searched(
     task: tuple[NumberLine | bytes, dict[int, DecisionHistory], int],
 ) -> list[tuple[Boundary | None, dict[int, DecisionHistory]]]:
-    """Find the lowest boundaries in a grid interval. Return each boundary with the runs of its search."""
+    """Find the lowest values in a grid interval at which decisions change, with the runs of each search."""
     own, ends, most = task
     line = _line_of(own)
     line.known |= ends

@@ -209,7 +209,7 @@ class SoftFloor(BallMethod):
 
 
 def softened(problem: BallProblem, eps: float) -> BallProblem:
-    """Return the problem with a soft floor (a softplus) or, for impacts, a spring.
+    """Return the problem with a softplus instead of the hard floor, or a spring instead of impacts.
 
     Raises:
         InputError: the ball would cross the soft floor of width eps in too few steps.

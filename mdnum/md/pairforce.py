@@ -510,7 +510,7 @@ class ManyBodyForce(eqx.Module):
         return self.policy.dtype("force")
 
     def placed(self, x: Float[Array, "atoms 3"], tables: Tables) -> Float[Array, "atoms 3"]:
-        """Return sorted positions in the atom order that the energy function requires."""
+        """Reorder the positions from sorted order to the atom order of the energy function."""
         # an energy that takes all atoms for alike sees the table's sorted order
         return jnp.zeros_like(x).at[tables.order].set(x) if self.potential.labeled else x
 

@@ -165,7 +165,7 @@ def _crowds() -> Named:
 def vast() -> Iterator[Case]:
     """Yield test cases whose box is too large for a simple grid of cells.
 
-    Cases with very large volume run in a separate process.
+    Each test case with a very large cell volume runs in a separate process.
     """
     apart = np.array([[0.0, 0.0, 0.0], [0.5, 0.5, 0.5], [700.0, 2500.0, 2400.0], [700.5, 2500.0, 2400.0]])
     yield once("two pairs thousands of cutoffs apart, free", "axes", apart)
