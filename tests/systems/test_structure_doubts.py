@@ -140,7 +140,7 @@ def test_the_command_line_and_a_run_say_so(tmp_path: Path, capsys: pytest.Captur
     code = call("systems", "check", str(path))
     text = capsys.readouterr().out
     assert code == 1
-    assert " K, but 94.40 K " in text and "fine" not in text
+    assert "0.639 K" in text and " 94.40 K " in text and "fine" not in text
     code = call("systems", "check", str(path), "--json")
     text = capsys.readouterr().out
     document = json.loads(text)
